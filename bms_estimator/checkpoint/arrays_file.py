@@ -1,7 +1,8 @@
 """Files of arrays beside the checkpoint of the same pack: the history with its last fit, and the observed load."""
 
+import contextlib
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,45 @@ class RejectedFileError(Exception):
     """A file cannot be used. The message gives the reason."""
 
 
+@contextlib.contextmanager
+def damage_rejected() -> Iterator[None]:
+    """Convert any exception of a damaged file to a ``RejectedFileError``. A missing file raises a ``FileNotFoundError``."""
+    try:
+        yield
+    except (FileNotFoundError, RejectedFileError):
+        raise
+    except UnsafeFileError as error:
+        raise RejectedFileError(str(error)) from error
+    except Exception as error:  # a damaged file may raise anything, and is reported
+        raise RejectedFileError(f"damaged, perhaps by a power cut ({type(error).__name__})") from error
+
+
+def read_arrays(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file of at most ``max_bytes``. A damaged file may raise any exception."""
+    with np.load(io.BytesIO(read_private(path, max_bytes)), allow_pickle=False) as file:
+        return dict(file)
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write arrays atomically to a file.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **arrays)
+    write_private(path, packed.getbuffer())
+
+
+def set_aside(path: Path, target: Path) -> str:
+    """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user."""
+    try:
+        path.replace(target)
+    except OSError as error:
+        return f"it cannot be set aside: {error}"
+    return f"set aside as {target.name}"
+
+
 class ArraysFile:
     """File of arrays of one pack, ``<pack.name>-<identity><suffix>``.
 
@@ -49,11 +89,8 @@ class ArraysFile:
         Raises:
             OSError: The file cannot be written.
         """
-        packed = io.BytesIO()
-        content: dict[str, Any] = {"format": FORMAT, "identity": self._identity, **arrays}
-        np.savez_compressed(packed, **content)
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_private(self.path, packed.getbuffer())
+        write_arrays(self.path, {"format": FORMAT, "identity": self._identity, **arrays})
 
     def load(self) -> dict[str, NDArray[Any]]:
         """Return the saved arrays; an empty dictionary without a file.
@@ -63,15 +100,11 @@ class ArraysFile:
         """
         self._is_later = False
         try:
-            with np.load(io.BytesIO(read_private(self.path, MAX_FILE_BYTES)), allow_pickle=False) as file:
-                arrays = dict(file)
-            version, identity = int(arrays.pop("format")), str(arrays.pop("identity"))
+            with damage_rejected():
+                arrays = read_arrays(self.path, MAX_FILE_BYTES)
+                version, identity = int(arrays.pop("format")), str(arrays.pop("identity"))
         except FileNotFoundError:
             return {}
-        except UnsafeFileError as error:
-            raise RejectedFileError(str(error)) from error
-        except Exception as error:  # a damaged file may raise anything, and is reported
-            raise RejectedFileError(f"damaged, perhaps by a power cut ({type(error).__name__})") from error
         self._is_later = version > FORMAT
         if version != FORMAT:
             raise RejectedFileError(f"format {version}, this version reads {FORMAT}")
@@ -81,9 +114,6 @@ class ArraysFile:
 
     def quarantine(self) -> str:
         """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user."""
-        kept = self.path.with_name(f"{self._name}.{'later' if self._is_later else 'refused'}{self._suffix}")
-        try:
-            self.path.replace(kept)
-        except OSError as error:
-            return f"it cannot be set aside: {error}"
-        return f"set aside as {kept.name}"
+        return set_aside(
+            self.path, self.path.with_name(f"{self._name}.{'later' if self._is_later else 'refused'}{self._suffix}")
+        )

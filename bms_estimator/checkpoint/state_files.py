@@ -10,6 +10,7 @@ import structlog
 from bms_estimator.checkpoint.arrays_file import HISTORY_SUFFIX, LOAD_SUFFIX, ArraysFile, RejectedFileError
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.run_file import RunFile, SavedRun
+from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
@@ -24,10 +25,11 @@ log = structlog.get_logger(__name__)
 class SavedPack(NamedTuple):
     """Pack as it was at its last save."""
 
+    name: str
     pack: Pack
-    age_s: float
-    """Time since the save [s]; infinite if unknown."""
-    load_reason: str
+    age_s: float | None = None
+    """Time since the save [s]; infinite if unknown; None: the pack was not saved, but is at the end of a capture."""
+    load_reason: str = ""
     """Reason for which the observed load is unknown; empty if it was restored or none was saved."""
 
 
@@ -51,12 +53,24 @@ class StateFiles:
     def __init__(
         self, folder: Path, settings: Settings, model: PackModel, now: Callable[[], BootTimestamp] = boot_timestamp
     ) -> None:
-        self._settings, self._model = settings, model
+        self._settings, self._model, self._now = settings, model, now
         self.checkpoint = CheckpointFile(folder, settings, model, now)
         self.history = ArraysFile(folder, settings, model, HISTORY_SUFFIX)
         self.load = ArraysFile(folder, settings, model, LOAD_SUFFIX)
         self.run_file = RunFile(folder, settings.pack.name, lambda: now().wall_s)
         self.thread = DiskThread("checkpoint")
+
+    def newest(self) -> "StateFiles":
+        """Return the files of the pack's last run, whose declared capacity may be another one; without any, these files."""
+        newest = self
+        if isinstance(self._model, CellModel):
+            for path, declared in self.checkpoint.other_declared():
+                r_s = self._model.r_s.model_copy(update={"offset_ohm": declared.r_s_ohm})
+                model = with_capacity(self._model, declared.capacity_ah).model_copy(update={"r_s": r_s})
+                other = StateFiles(path.parent, self._settings, model, self._now)
+                if other.checkpoint.path == path and other.checkpoint.saved_ns > newest.checkpoint.saved_ns:
+                    newest = other
+        return newest
 
     def read(self) -> PackState:
         """Return the saved state of the pack. The files remain unchanged."""
@@ -75,19 +89,21 @@ class StateFiles:
         Returns:
             Outcome of the checkpoint as text.
         """
-        state = self.read()
+        source = self.newest()
+        state = source.read()
         outcomes = {**state.reasons, **pack.restore(state, state.gap_s)}
         files: dict[str, CheckpointFile | ArraysFile] = {
-            CHECKPOINT: self.checkpoint,
-            HISTORY: self.history,
-            LOAD: self.load,
+            CHECKPOINT: source.checkpoint,
+            HISTORY: source.history,
+            LOAD: source.load,
         }
         for name, outcome in outcomes.items():
             file = files.get(name)
             if file and outcome.startswith(REFUSED):
                 outcomes[name] = f"{outcome}; {file.quarantine()}"
-            write_log = log.warning if outcome.startswith(REFUSED) else log.info
-            write_log(name, outcome=outcomes[name], **({"file": str(file.path)} if file else {}))
+            (log.warning if outcome.startswith(REFUSED) else log.info)(
+                name, outcome=outcomes[name], **({"file": str(file.path)} if file else {})
+            )
         return outcomes[CHECKPOINT]
 
     def saved_pack(self) -> SavedPack:
@@ -96,7 +112,7 @@ class StateFiles:
         Raises:
             UserError: There is no valid checkpoint, or the service ran without the identifier.
         """
-        state, pack = self.read(), new_pack(self._settings, self._model)
+        state, pack = self.newest().read(), new_pack(self._settings, self._model)
         path = self.checkpoint.path
         if reason := state.reasons.get(CHECKPOINT):
             raise UserError(
@@ -105,11 +121,10 @@ class StateFiles:
             )
         outcomes = {**state.reasons, **pack.restore(state, 0.0)}
         refused = {name: outcome for name, outcome in outcomes.items() if outcome.startswith(REFUSED)}
-        if reason := refused.get(CURVES) or refused.get(CHECKPOINT):
+        off = "" if pack.estimator.record[0]["filter"]["started"] else "the identifier was off"
+        if reason := refused.get(CURVES) or refused.get(CHECKPOINT) or off:
             raise UserError(f"{path}: nothing was learned: {reason}")
-        if not pack.estimator.record[0]["filter"]["started"]:
-            raise UserError(f"{path}: nothing was learned: the identifier was off")
-        return SavedPack(pack, state.gap_s, refused.get(LOAD, "").removeprefix(REFUSED))
+        return SavedPack(self._settings.pack.name, pack, state.gap_s, refused.get(LOAD, "").removeprefix(REFUSED))
 
     def read_counters(self) -> SavedRun:
         """Return counters and alarms of earlier runs. A damaged file is quarantined."""

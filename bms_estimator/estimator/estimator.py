@@ -156,12 +156,12 @@ class Estimator:
     @property
     def soc(self) -> float:
         """State of charge after the last accepted sample, 0..1; NaN before the first one, and for a fuel cell."""
-        return float(self.state["soc"][0]) if self.state["samples"][0] else math.nan
+        return float(self.state["soc"][0]) if self.state["started"][0] else math.nan
 
     @property
     def soc_std(self) -> float:
         """Standard deviation of ``soc``; NaN without the identifier."""
-        if not (self.identifying and self.state["samples"][0]):
+        if not (self.identifying and self.state["started"][0]):
             return math.nan
         return float(weakest_cell_soc_std(self.record[0]["filter"], self.settings_record[0]["filter"]))
 

@@ -11,6 +11,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import TraceBlock, new_estimator
+from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
@@ -20,7 +21,18 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
-from bms_estimator.pack.state import CELLS, CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, PackState
+from bms_estimator.pack.declared_capacity import with_capacity
+from bms_estimator.pack.state import (
+    CAPACITY,
+    CELLS,
+    CHECKPOINT,
+    CURVES,
+    HISTORY,
+    LOAD,
+    REFUSED,
+    Declared,
+    PackState,
+)
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import use_fitted_curves
 from bms_estimator.pack_model.history import History
@@ -150,6 +162,7 @@ class Pack:
             Outcomes by the names of the parts; those of refused parts begin with ``REFUSED``.
         """
         outcomes: dict[str, str] = {}
+        state = self._with_present_capacity(state, outcomes)
         curves = _converted(CURVES, lambda: fit_of_curves(state.curves), outcomes)
         if self.slow_fit:
             saved = _converted(HISTORY, lambda: history_of(state.history), outcomes) if state.history else None
@@ -169,9 +182,26 @@ class Pack:
                 outcomes.setdefault(HISTORY, f"restored: {self.slow_fit.history.rows.size} rows")
         if self.cells and is_restored and (reason := self.cells.restore(state.cells, gap_s)):
             outcomes[CELLS] = f"{REFUSED}{reason}"
-        if self.forecaster:
-            self._restore_load(self.forecaster, state.load, outcomes)
+        if forecaster := self.forecaster:
+            forecaster.deviations = self.cells.deviations if self.cells else None
+            if state.load:
+                _converted(LOAD, lambda: restore_load(forecaster.load, forecaster.past, state.load), outcomes)
+                outcomes.setdefault(LOAD, f"restored: {forecaster.load.seconds} s")
         return outcomes
+
+    def _with_present_capacity(self, state: PackState, outcomes: dict[str, str]) -> PackState:
+        """Return a state relative to the present declared capacity; without a record if it cannot be converted."""
+        before, declared = state.declared, Declared.by(self.model)
+        if before is None or declared is None or before == declared:
+            return state
+        p = self.estimator.cell_file_settings
+        converted = _converted(CHECKPOINT, lambda: with_capacity(state, before, declared, p), outcomes)
+        if converted is None:
+            return PackState(load=state.load, reasons=outcomes)
+        outcomes[CAPACITY] = (
+            f"corrected from {before.capacity_ah:g} to {declared.capacity_ah:g} Ah; what is restored keeps its values in Ah and ohm"
+        )
+        return converted
 
     def _restore_record(self, state: PackState, gap_s: float, outcomes: dict[str, str]) -> bool:
         """Restore the estimator's record. Return False if there is none, or if it is refused."""
@@ -180,8 +210,12 @@ class Pack:
         if reason := restore_state(self.estimator, state.record, gap_s):
             outcomes[CHECKPOINT] = f"{REFUSED}{reason}"
             return False
-        soc = float(self.estimator.state["soc"][0])
+        soc = self.estimator.soc
         outcomes[CHECKPOINT] = "restored" if math.isnan(soc) else f"restored: SOC {soc:.4f}"
+        if CAPACITY in outcomes:
+            outcomes[CAPACITY] += (
+                f": SOC {soc:.4f}, capacity {relative_capacity(self.estimator.record[0]).value:.3f} of the declared one, and all totals"
+            )
         return True
 
     def _resume_history(
@@ -195,13 +229,6 @@ class Pack:
             slow_fit.load(History(), None, curves)
             self.estimator.discard_rows()
             slow_fit.resume(gap_s, restored=restored)
-
-    def _restore_load(self, forecaster: Forecaster, load: Arrays, outcomes: dict[str, str]) -> None:
-        """Restore the observed load, and set the deviations of the single cells."""
-        forecaster.deviations = self.cells.deviations if self.cells else None
-        if load:
-            _converted(LOAD, lambda: restore_load(forecaster.load, forecaster.past, load), outcomes)
-            outcomes.setdefault(LOAD, f"restored: {forecaster.load.seconds} s")
 
 
 def _converted(name: str, convert: Callable[[], T], outcomes: dict[str, str]) -> T | None:
@@ -245,16 +272,8 @@ def new_pack(
     slow_fit = None
     if estimator.identifying and settings.identifier.pack_model:
         slow_fit = SlowFit(estimator, submit=submit, on_failure=on_failure)
-    forecaster = make_forecaster(settings, model, estimator)
+    forecaster = None
+    if estimator.identifying and isinstance(model, CellModel):
+        cutoff_v = load_cutoff_v(settings, model)
+        forecaster = Forecaster(estimator, cutoff_v=cutoff_v, limits=power_limits(settings, model))
     return Pack(estimator, slow_fit, CellEstimator(estimator), forecaster, has_forecasts=has_forecasts)
-
-
-def make_forecaster(settings: Settings, model: PackModel, estimator: Estimator) -> Forecaster | None:
-    """Return the forecaster of an estimator; None for a fuel cell, and without the identifier.
-
-    Raises:
-        UserError: The cut-off voltage is not below the voltage of the full pack.
-    """
-    if not (estimator.identifying and isinstance(model, CellModel)):
-        return None
-    return Forecaster(estimator, cutoff_v=load_cutoff_v(settings, model), limits=power_limits(settings, model))

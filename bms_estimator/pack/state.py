@@ -3,15 +3,30 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
+
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import PackModel
 
 Arrays = Mapping[str, NDArray[Any]]
 REFUSED = "refused: "
 """Prefix of the reason for which a part was refused."""
-CHECKPOINT, CURVES, CELLS, HISTORY, LOAD = "checkpoint", "curves", "cells", "history", "load"
+CHECKPOINT, CURVES, CELLS, HISTORY, LOAD, CAPACITY = "checkpoint", "curves", "cells", "history", "load", "capacity"
 """Names of the parts in outcomes."""
+
+
+class Declared(NamedTuple):
+    """Values of a battery's model to which learned values are relative."""
+
+    capacity_ah: float
+    r_s_ohm: float
+
+    @classmethod
+    def by(cls, model: PackModel) -> "Declared | None":
+        """Return the values of a model; None for a fuel cell."""
+        return cls(model.cell.capacity_ah, model.r_s.offset_ohm) if isinstance(model, CellModel) else None
 
 
 @dataclass(frozen=True)
@@ -31,5 +46,7 @@ class PackState:
     """Observed load (``forecast.saved_load.load_arrays``)."""
     gap_s: float = math.inf
     """Time since ``record`` was saved [s]; infinite if unknown."""
+    declared: Declared | None = None
+    """Declared values of the pack at the save; None: the present ones."""
     reasons: Mapping[str, str] = field(default_factory=dict)
     """Reason for which a part is empty, by its name; it begins with ``REFUSED`` if the part exists."""

@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 from bms_estimator.checkpoint.arrays_file import HISTORY_SUFFIX, LOAD_SUFFIX
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.state_files import StateFiles
-from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.cells.records import BANK as BANK_STATE
@@ -23,12 +21,11 @@ from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.pack import pack
-from bms_estimator.pack.pack import make_forecaster
+from bms_estimator.pack.pack import new_pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning, solve
 from bms_estimator.pack_model.history import ReferenceDischarges, WeakCellTime
-from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
+from bms_estimator.pack_model.learning import Submit, run_now
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays, neutral_fit
 from bms_estimator.settings.pack import Settings
 
@@ -64,7 +61,7 @@ RECORDS = {
 }
 """Types of the structured arrays."""
 FIT_FIELDS = tuple(curve_arrays(neutral_fit()))
-METADATA = ("observer", "token", "wall_s", "synchronised", "boot_s", "boot")
+METADATA = ("capacity_ah", "r_s_ohm", "observer", "token", "wall_s", "synchronised", "boot_s", "boot")
 PLACES: tuple[Place, ...] = (
     *((file, name, field) for (file, name), record in RECORDS.items() for field, _ in fields(np.zeros(1, record))),
     *((STATE_SUFFIX, name, "") for name in (*METADATA, *(f"fit.{name}" for name in FIT_FIELDS))),
@@ -92,13 +89,16 @@ class Pack:
 
     def __init__(self, folder: Path, submit: Submit = run_now) -> None:
         self.files = StateFiles(folder, SETTINGS, CELL)
-        self.estimator = new_estimator(SETTINGS, CELL)
-        self.cells = CellEstimator(self.estimator)
-        self.slow_fit = SlowFit(self.estimator, interval_s=FIT_S, submit=submit)
-        forecaster = make_forecaster(SETTINGS, CELL, self.estimator)
-        assert forecaster
-        self.forecaster = forecaster
-        self.pack = pack.Pack(self.estimator, self.slow_fit, self.cells, forecaster, has_forecasts=False)
+        self.pack = pack = new_pack(SETTINGS, CELL, submit=submit, has_forecasts=False)
+        assert pack.slow_fit
+        assert pack.cells
+        assert pack.forecaster
+        self.estimator, self.slow_fit, self.cells, self.forecaster = (
+            pack.estimator,
+            pack.slow_fit,
+            pack.cells,
+            pack.forecaster,
+        )
         self.files.restore(self.pack)
 
     def save(self) -> None:

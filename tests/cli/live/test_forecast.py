@@ -1,6 +1,7 @@
 """``forecast``: from the checkpoint of a pack, and from the end of a capture."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -122,6 +123,7 @@ def test_without_a_saved_load_the_reason_is_printed(
     load_file(copy).unlink()
     code, out, _ = run(capsys, "forecast", copy)
     assert code == 0
+    assert re.search(r"SOC now +\d+\.\d% ± \d+\.\d%", out)
     assert "unknown: less than 300 s of load have been seen" in out
 
 
