@@ -4,28 +4,35 @@ Each ``pack_identity`` has its own file with named fields. Therefore no state is
 with other fields is installed.
 """
 
-import io
+import contextlib
 import math
 import os
 import re
 import secrets
 import shlex
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.checkpoint.arrays_file import (
+    HISTORY_SUFFIX,
+    LOAD_SUFFIX,
+    RejectedFileError,
+    damage_rejected,
+    read_arrays,
+    set_aside,
+    write_arrays,
+)
 from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, Base, ChangesFile
-from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX
-from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity, without_observer
-from bms_estimator.checkpoint.run_file import RunFile
+from bms_estimator.checkpoint.identity import observer_identity, pack_identity, without_observer
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.pack.state import CHECKPOINT, REFUSED, Declared, PackState
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
-from bms_estimator.process.disk_thread import DiskThread
-from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.pack import Settings
 
 FORMAT = 8
@@ -39,31 +46,12 @@ MAX_FILE_BYTES = 1 << 20
 """Maximum size of a checkpoint file [bytes]. A file of the former format has about 112 kB."""
 MAX_FILES = 8
 """Maximum number of checkpoint files of one pack; older ones are deleted."""
-REJECTED = "refused: "
-"""Prefix of the reason for rejecting a file."""
 MAX_LATER_FILES = 4
 """Maximum number of quarantined files of later formats, which serve a return to the later version."""
 _CELLS = "cells."
 """Prefix of the names of the arrays of single cells in the file."""
 _CURVES = "fit."
 """Prefix of the names of the fit's arrays in the file."""
-
-
-@dataclass(frozen=True)
-class CheckpointContent:
-    """Content of a checkpoint file."""
-
-    state: Mapping[str, NDArray[Any]]
-    """Fields of ESTIMATOR_STATE by their names, as from ``fields``; empty if the file was rejected."""
-    unseen_s: float
-    """Time since the state was saved [s]; infinite if unknown."""
-    reason: str
-    """Reason for the rejection; empty if the file is valid."""
-    curves: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """Arrays of the fit to whose curves the state is relative (``pack_model.saved.curve_arrays``); empty: the curves are
-    those of the cell file."""
-    cells: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    """State of the estimators of single cells (``CellEstimator.saved_state``); empty without cell voltages."""
 
 
 class CheckpointFile:
@@ -81,16 +69,13 @@ class CheckpointFile:
     ) -> None:
         self._name, self._now = settings.pack.name, now
         self._identity, self._observer = pack_identity(settings, cell), observer_identity(settings, cell)
+        self._declared = Declared.by(cell)
         self._longest_days = settings.state.longest_days
         self._is_later = False  # the file has a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
         self._changes = ChangesFile(self.path)
-        self.run_file = RunFile(folder, self._name, lambda: now().wall_s)
-        """Counters and alarms of the pack."""
         self.disk_free_mib: float | None = None
         """Free space on the disk at the last write [MiB]."""
-        self.thread = DiskThread("checkpoint")
-        """Thread for all writes of the pack's state. A call that timed out still finishes before the next one."""
 
     def save(
         self,
@@ -120,32 +105,45 @@ class CheckpointFile:
         if not whole and self.path.exists() and self._changes.save(state, curves, now):
             return
         token = secrets.token_hex(8)
-        content = {
+        content: dict[str, Any] = {
+            "format": FORMAT,
             "identity": self._identity,
             "observer": self._observer,
             "token": token,
             "state": state,
             **asdict(now),
+            **(self._declared._asdict() if self._declared else {}),
         }
         content |= {f"{_CURVES}{name}": array for name, array in curves.items()}
         content |= {f"{_CELLS}{name}": array for name, array in (cells or {}).items()}
-        packed = io.BytesIO()
-        np.savez_compressed(packed, format=FORMAT, **content)
-        write_private(self.path, packed.getbuffer())
+        write_arrays(self.path, content)
         self._changes.set_base(Base(token, state.copy(), curves, now))
         self._remove_oldest()
 
-    def load(self) -> CheckpointContent:
-        """Read the file. An error is returned as the result's ``reason``."""
+    def load(self) -> PackState:
+        """Read the state of estimator and single cells. An error is returned in the result's ``reasons``."""
         try:
-            with np.load(io.BytesIO(read_private(self.path, MAX_FILE_BYTES)), allow_pickle=False) as file:
-                return self._validate(file)
+            with damage_rejected():
+                return self._validate(read_arrays(self.path, MAX_FILE_BYTES))
         except FileNotFoundError:
-            return CheckpointContent({}, 0.0, "none found")
-        except (_RejectedError, UnsafeFileError) as error:
-            return CheckpointContent({}, 0.0, f"{REJECTED}{error}")
-        except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            return CheckpointContent({}, 0.0, f"{REJECTED}damaged, perhaps by a power cut ({type(error).__name__})")
+            return PackState(reasons={CHECKPOINT: "none found"})
+        except RejectedFileError as error:
+            return PackState(reasons={CHECKPOINT: f"{REFUSED}{error}"})
+
+    @property
+    def saved_ns(self) -> int:
+        """Time of the last save [ns since 1970]; 0 without a file."""
+        paths = [self.path, *(self.path.with_suffix(suffix) for suffix in CHANGES_SUFFIXES)]
+        return max((path.lstat().st_mtime_ns for path in paths if path.exists()), default=0)
+
+    def other_declared(self) -> Iterator[tuple[Path, Declared]]:
+        """Yield the pack's other checkpoints with a declared capacity. Damaged files are ignored."""
+        for path in self._other_paths():
+            with contextlib.suppress(Exception):  # a damaged file may raise anything
+                file = read_arrays(path, MAX_FILE_BYTES)
+                declared = Declared(*(float(file[name]) for name in Declared._fields))
+                if all(0.0 < value < math.inf for value in declared):
+                    yield path, declared
 
     def quarantine(self) -> str:
         """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user.
@@ -159,58 +157,54 @@ class CheckpointFile:
             paths = [self.path.with_name(f"{self._name}.later-{n}.npz") for n in range(1, MAX_LATER_FILES + 1)]
             unused_paths = (path for path in paths if not path.exists())
             quarantined = next(unused_paths, paths[-1])  # without an unused name the last file is overwritten
-        try:
-            self.path.replace(quarantined)
-        except OSError as error:
-            return f"it cannot be set aside: {error}"
-        if not self._is_later:
-            return f"set aside as {quarantined.name}"
+        outcome = set_aside(self.path, quarantined)
+        if not self._is_later or self.path.exists():
+            return outcome
         command = shlex.join(["mv", str(quarantined.resolve()), str(self.path.resolve())])
-        return (
-            f"set aside as {quarantined.name}; once the version that wrote it is installed again, "
-            f"stop the service and `{command}`"
-        )
+        return f"{outcome}; once the version that wrote it is installed again, stop the service and `{command}`"
 
-    def _validate(self, content: Mapping[str, NDArray[Any]]) -> CheckpointContent:
+    def _validate(self, file: Mapping[str, NDArray[Any]]) -> PackState:
         """Return the content of a file.
 
         Raises:
-            _RejectedError: The file has another format or identity, or is too old.
+            RejectedFileError: The file has another format or identity, or is too old.
         """
-        version = int(content["format"])
+        version = int(file["format"])
         self._is_later = version > FORMAT
         if version not in (FORMER_FORMAT, FORMAT):
-            raise _RejectedError(f"format {version}, this version reads {FORMAT}")
-        if str(content["identity"]) != self._identity:
-            raise _RejectedError("it belongs to another pack or cell")
-        file = dict(content)
+            raise RejectedFileError(f"format {version}, this version reads {FORMAT}")
+        if str(file["identity"]) != self._identity:
+            raise RejectedFileError("it belongs to another pack or cell")
         state = dict(fields(file["state"]))
         saved = BootTimestamp(
             float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"])
         )
         if version == FORMAT and (changes := self._changes.load(str(file["token"]), file["state"].dtype)):
             state, saved = state | changes.state, changes.saved
-        unseen_s = self._now().since(saved)
-        if self._longest_days is not None and self._longest_days * DAY_S < unseen_s < math.inf:
-            days = f"{unseen_s / DAY_S:.1f} days old"
-            raise _RejectedError(f"it is {days}, state.longest_days is {self._longest_days:g}")
+        gap_s = self._now().since(saved)
+        if self._longest_days is not None and self._longest_days * DAY_S < gap_s < math.inf:
+            days = f"{gap_s / DAY_S:.1f} days old"
+            raise RejectedFileError(f"it is {days}, state.longest_days is {self._longest_days:g}")
         if str(file["observer"]) != self._observer:
             state = without_observer(state)
-        return CheckpointContent(state, unseen_s, "", _with_prefix(file, _CURVES), _with_prefix(file, _CELLS))
+        return PackState(
+            state, _with_prefix(file, _CURVES), _with_prefix(file, _CELLS), gap_s=gap_s, declared=self._declared
+        )
 
     def _remove_oldest(self) -> None:
         """Remove the pack's oldest files beyond ``MAX_FILES``, because each configured cell leaves a file."""
-        ours = re.compile(rf"{re.escape(self._name)}-[0-9a-f]{{8}}\.npz")
-        others = [path for path in self.path.parent.iterdir() if ours.fullmatch(path.name) and path != self.path]
+        others = self._other_paths()
         others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
         for path in others[MAX_FILES - 1 :]:
             path.unlink(missing_ok=True)
-            for suffix in (SUFFIX, LOAD_SUFFIX, *CHANGES_SUFFIXES):
+            for suffix in (HISTORY_SUFFIX, LOAD_SUFFIX, *CHANGES_SUFFIXES):
                 path.with_suffix(suffix).unlink(missing_ok=True)
 
-
-class _RejectedError(Exception):
-    """Reason for rejecting a checkpoint."""
+    def _other_paths(self) -> list[Path]:
+        """Return the pack's checkpoints with other identities."""
+        ours = re.compile(rf"{re.escape(self._name)}-[0-9a-f]{{8}}\.npz")
+        folder = self.path.parent.iterdir() if self.path.parent.is_dir() else ()
+        return [path for path in folder if ours.fullmatch(path.name) and path != self.path]
 
 
 def _with_prefix(file: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

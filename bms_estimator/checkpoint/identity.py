@@ -1,10 +1,9 @@
 """Identities of a checkpoint: hashes of the pack and of the settings that its state depends on."""
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.cell import ChenMoraOcv
@@ -34,15 +33,6 @@ def observer_identity(settings: Settings, cell: PackModel) -> str:
     """
     parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
     return hashlib.sha256(repr(parts).encode()).hexdigest()
-
-
-def fields(record: NDArray[np.void], prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield name and view of each field of a structured array, recursively as ``part.field``."""
-    for name in record.dtype.names or ():
-        if record[name].dtype.names:
-            yield from fields(record[name], f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", record[name]
 
 
 def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -223,6 +223,10 @@ class CellEstimator:
         self.bank["time_s"] = np.inf
         self.bank["unseen_s"] = unseen_s if math.isfinite(unseen_s) else 0.0
 
+    def extend_gap(self, wait_s: float) -> None:
+        """Extend the gap of ``resume`` by a further time without samples [s]."""
+        self.bank["unseen_s"] += wait_s
+
 
 def _invalid_reason(cells: Records, bank: Records) -> str:
     """Return the reason for which a saved state is invalid; empty if it is valid."""

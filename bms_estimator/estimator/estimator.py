@@ -7,9 +7,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.estimator.curve_change import return_to_cell_file, use_curves
+from bms_estimator.estimator.fitted_state import FittedState, write_fitted_state
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
-from bms_estimator.kernels.accumulators.history import add_reference
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW, add_reference, complete_row
 from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR
 from bms_estimator.kernels.kalman_filter.hypotheses import USER_SOC_STD, set_soc, weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
@@ -98,6 +100,13 @@ class Estimator:
         other._trace = np.zeros(0, dtype=TRACE)  # noqa: SLF001 - an instance of this class
         return other
 
+    def copy(self) -> Self:
+        """Return an independent copy in the present state, with the present curves."""
+        other = self.bound_to_record(self.record.copy())
+        other.settings_record = self.settings_record.copy()
+        other.settings = other.settings_record["observer"]
+        return other
+
     def step(
         self, time_s: float, current_a: float, voltage_v: float, status: int = 0, temperature_c: float = math.nan
     ) -> SampleOutcome:
@@ -147,12 +156,12 @@ class Estimator:
     @property
     def soc(self) -> float:
         """State of charge after the last accepted sample, 0..1; NaN before the first one, and for a fuel cell."""
-        return float(self.state["soc"][0]) if self.state["samples"][0] else math.nan
+        return float(self.state["soc"][0]) if self.state["started"][0] else math.nan
 
     @property
     def soc_std(self) -> float:
         """Standard deviation of ``soc``; NaN without the identifier."""
-        if not (self.identifying and self.state["samples"][0]):
+        if not (self.identifying and self.state["started"][0]):
             return math.nan
         return float(weakest_cell_soc_std(self.record[0]["filter"], self.settings_record[0]["filter"]))
 
@@ -177,8 +186,75 @@ class Estimator:
                 c["last_v"] = 0.0
             store_last_good_state(c, f)
 
-    def restart(self) -> None:
-        """Return to the state before the first sample, for another pack. The counters of the samples stay."""
+    def use_curves(self, settings: np.void) -> None:
+        """Use the curves of another record of dtype EKF_SETTINGS. R_s in ohm does not change."""
+        use_curves(self.record[0]["filter"], self.settings_record["filter"], settings)
+
+    def return_to_cell_file(self) -> None:
+        """Use the curves of the cell file again. SOC, capacity and the present resistances do not change."""
+        f, c = self.record[0]["filter"], self.record[0]["checks"]
+        return_to_cell_file(f, self.settings_record["filter"], self.cell_file_settings)
+        if f["started"]:
+            store_last_good_state(c, f)
+
+    def adopt(self, state: FittedState) -> None:
+        """Replace the filter's state by the results of a fit, whose curves are in use."""
+        f = self.record[0]["filter"]
+        write_fitted_state(f, self.settings_record[0]["filter"], state)
+        if state.soc is not None:
+            self.state["soc"] = f["soc"]
+        if state.is_exchanged:
+            f["exchanged"] = 1  # raises the input diagnostic of an exchange
+        store_last_good_state(self.record[0]["checks"], f)
+
+    def load_exact(self, record: NDArray[np.void], settings_record: NDArray[np.void]) -> None:
+        """Return to copies of ``record`` and ``settings_record``, to the last bit."""
+        self.record[...], self.settings_record[...] = record, settings_record
+
+    def schedule(self, event_s: float) -> None:
+        """Record history rows, and let ``run_part`` stop at a time on the clock of the history [s]; infinite: never."""
+        h = self.record[0]["history"]
+        h["enabled"], h["event_s"] = 1, event_s
+
+    def take_rows(self) -> NDArray[np.void]:
+        """Remove the completed history rows from the record, and return them."""
+        h = self.record[0]["history"]
+        rows: NDArray[np.void] = h["rows"][: int(h["count"])].copy()
+        if rows.size:
+            h["count"] = 0
+            h["rows"] = np.zeros(1, HISTORY_ROW)  # unused rows would depend on the division of the samples into blocks
+        return rows
+
+    def discard_rows(self) -> None:
+        """Discard all history rows, also the present one."""
+        h = self.record[0]["history"]
+        h["count"] = h["sums"]["duration_s"] = 0
+
+    def complete_rows(self) -> NDArray[np.void]:
+        """Complete the present history row, and return a copy of all rows of the record."""
+        h = self.record[0]["history"]
+        complete_row(h)
+        rows: NDArray[np.void] = h["rows"][: int(h["count"])].copy()
+        return rows
+
+    def begin_segment(self, elapsed_s: float, segment: float, gap_s: float) -> None:
+        """Begin a segment of the history without rows.
+
+        Args:
+            elapsed_s: Minimum time on the clock of the history [s].
+            segment: Minimum number of the previous segment.
+            gap_s: Time since the previous segment [s]; infinite if unknown.
+        """
+        h = self.record[0]["history"]
+        h["elapsed_s"], h["segment"] = max(h["elapsed_s"], elapsed_s), max(h["segment"], segment) + 1
+        h["gap_s"] = gap_s
+        h["count"] = h["direction"] = 0
+        h["charge_as"] = h["charge_variance_as2"] = h["throughput_soc"] = h["direction_s"] = h["row_as"] = 0.0
+        h["hysteresis"] = 0.0
+
+    def forget(self) -> None:
+        """Return to the cell file and to the state before the first sample, for another pack. The counters of the samples stay."""
+        self.return_to_cell_file()
         counters = {name: self.state[name].copy() for name in OBSERVER_COUNTERS}
         self.record[...] = np.zeros(1, ESTIMATOR_STATE)
         for name, count in counters.items():
@@ -196,6 +272,11 @@ class Estimator:
         if self.identifying:
             self.record["filter"]["soc"] = self.state["soc"]
             self.record["filter"]["smallest_a"] = 0.0  # the resolution is measured again
+
+    def extend_gap(self, wait_s: float) -> None:
+        """Extend the gap of ``resume`` by a further time without samples [s]."""
+        self.record["unseen_s"] += wait_s
+        self.record["history"]["gap_s"] += wait_s
 
 
 def make_estimator(settings: Settings, cell: PackModel) -> Estimator:

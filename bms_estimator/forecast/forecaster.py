@@ -108,11 +108,8 @@ class Forecaster:
 
     def copy(self) -> Self:
         """Return a copy in the present state, from which another thread can forecast while samples still arrive."""
-        estimator = self.estimator.bound_to_record(self.estimator.record.copy())
-        estimator.settings_record = estimator.settings_record.copy()  # the slow fit changes its curves
-        estimator.settings = estimator.settings_record["observer"]
         other = copy(self)
-        other.estimator, other.load = estimator, copy(self.load)
+        other.estimator, other.load = self.estimator.copy(), copy(self.load)
         other.past = copy(self.past)  # its arrays are never changed in place
         other.load.record = self.load.record.copy()
         return other

@@ -1,6 +1,6 @@
 """Array and record types of kernels and their callers."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,3 +20,12 @@ def structured_array(columns: Mapping[str, Floats]) -> Records:
     for name, values in columns.items():
         rows[name] = values
     return rows
+
+
+def fields(record: Records, prefix: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield name and view of each field of a structured array, recursively as ``part.field``."""
+    for name in record.dtype.names or ():
+        if record[name].dtype.names:
+            yield from fields(record[name], f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", record[name]

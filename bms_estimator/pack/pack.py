@@ -1,7 +1,9 @@
 """One pack as one object: the only place that assembles its stages and runs them in their order."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -9,15 +11,36 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import TraceBlock, new_estimator
+from bms_estimator.estimator.identified_parameters import relative_capacity
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
 from bms_estimator.forecast.forecaster import Forecaster
+from bms_estimator.forecast.saved_load import restore_load
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
+from bms_estimator.pack.declared_capacity import with_capacity
+from bms_estimator.pack.state import (
+    CAPACITY,
+    CELLS,
+    CHECKPOINT,
+    CURVES,
+    HISTORY,
+    LOAD,
+    REFUSED,
+    Declared,
+    PackState,
+)
+from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.pack_model.handover import use_fitted_curves
+from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
+from bms_estimator.pack_model.saved import fit_of_curves, history_of
 from bms_estimator.settings.pack import Settings
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -68,6 +91,18 @@ class Pack:
         """Model of the whole pack."""
         return self.estimator.cell
 
+    def waited(self, wait_s: float) -> None:
+        """Extend the gap before the first accepted sample after ``restore``. Later calls have no effect.
+
+        Args:
+            wait_s: Time without samples since ``restore`` or the last call [s].
+        """
+        state = self.estimator.state[0]
+        if state["started"] and not state["samples"]:
+            self.estimator.extend_gap(wait_s)
+            if self.cells:
+                self.cells.extend_gap(wait_s)
+
     def run(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS) -> Step:
         """Process a block of samples.
 
@@ -113,6 +148,103 @@ class Pack:
             start, rows = end, rows + written
         return rows
 
+    def restore(self, state: PackState, gap_s: float) -> dict[str, str]:
+        """Restore the state of an earlier run, before the first sample. A part that is refused begins empty.
+
+        The curves come first, because the record is relative to them. The history follows the record, because its
+        continuation depends on whether the record was restored.
+
+        Args:
+            state: State to restore.
+            gap_s: Time without samples since the state was saved [s]; infinite if unknown.
+
+        Returns:
+            Outcomes by the names of the parts; those of refused parts begin with ``REFUSED``.
+        """
+        outcomes: dict[str, str] = {}
+        state = self._with_present_capacity(state, outcomes)
+        curves = _converted(CURVES, lambda: fit_of_curves(state.curves), outcomes)
+        if self.slow_fit:
+            saved = _converted(HISTORY, lambda: history_of(state.history), outcomes) if state.history else None
+            self.slow_fit.load(*(saved or (History(), None)), curves)
+        elif curves:
+            use_fitted_curves(self.estimator, curves)
+        is_restored = self._restore_record(state, gap_s, outcomes)
+        if state.curves and (self.slow_fit is None or curves is None):
+            # Without a slow fit the resistances are converted to the curves of the cell file. If the saved curves are damaged,
+            # this is impossible, and the resistances start with the std of the cell file again.
+            self.estimator.return_to_cell_file()
+        if self.slow_fit:
+            self._resume_history(
+                self.slow_fit, gap_s if is_restored else math.inf, curves, outcomes, restored=is_restored
+            )
+            if state.history:
+                outcomes.setdefault(HISTORY, f"restored: {self.slow_fit.history.rows.size} rows")
+        if self.cells and is_restored and (reason := self.cells.restore(state.cells, gap_s)):
+            outcomes[CELLS] = f"{REFUSED}{reason}"
+        if forecaster := self.forecaster:
+            forecaster.deviations = self.cells.deviations if self.cells else None
+            if state.load:
+                _converted(LOAD, lambda: restore_load(forecaster.load, forecaster.past, state.load), outcomes)
+                outcomes.setdefault(LOAD, f"restored: {forecaster.load.seconds} s")
+        return outcomes
+
+    def _with_present_capacity(self, state: PackState, outcomes: dict[str, str]) -> PackState:
+        """Return a state relative to the present declared capacity; without a record if it cannot be converted."""
+        before, declared = state.declared, Declared.by(self.model)
+        if before is None or declared is None or before == declared:
+            return state
+        p = self.estimator.cell_file_settings
+        converted = _converted(CHECKPOINT, lambda: with_capacity(state, before, declared, p), outcomes)
+        if converted is None:
+            return PackState(load=state.load, reasons=outcomes)
+        outcomes[CAPACITY] = (
+            f"corrected from {before.capacity_ah:g} to {declared.capacity_ah:g} Ah; what is restored keeps its values in Ah and ohm"
+        )
+        return converted
+
+    def _restore_record(self, state: PackState, gap_s: float, outcomes: dict[str, str]) -> bool:
+        """Restore the estimator's record. Return False if there is none, or if it is refused."""
+        if CHECKPOINT in state.reasons:
+            return False
+        if reason := restore_state(self.estimator, state.record, gap_s):
+            outcomes[CHECKPOINT] = f"{REFUSED}{reason}"
+            return False
+        soc = self.estimator.soc
+        outcomes[CHECKPOINT] = "restored" if math.isnan(soc) else f"restored: SOC {soc:.4f}"
+        if CAPACITY in outcomes:
+            outcomes[CAPACITY] += (
+                f": SOC {soc:.4f}, capacity {relative_capacity(self.estimator.record[0]).value:.3f} of the declared one, and all totals"
+            )
+        return True
+
+    def _resume_history(
+        self, slow_fit: SlowFit, gap_s: float, curves: PackFit | None, outcomes: dict[str, str], *, restored: bool
+    ) -> None:
+        """Continue the history. One that cannot be continued is refused, together with its rows in the record."""
+        try:
+            slow_fit.resume(gap_s, restored=restored)
+        except Exception as error:  # noqa: BLE001 - a damaged file must not end the service at each start
+            outcomes[HISTORY] = _refusal(error)
+            slow_fit.load(History(), None, curves)
+            self.estimator.discard_rows()
+            slow_fit.resume(gap_s, restored=restored)
+
+
+def _converted(name: str, convert: Callable[[], T], outcomes: dict[str, str]) -> T | None:
+    """Return the result of ``convert``; None with an outcome if the arrays of a part are damaged."""
+    try:
+        return convert()
+    except Exception as error:  # noqa: BLE001 - a damaged file must not end the service at each start
+        outcomes[name] = _refusal(error)
+        return None
+
+
+def _refusal(error: Exception) -> str:
+    """Return the outcome of a part whose arrays are damaged."""
+    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    return f"{REFUSED}{kind}{error}"
+
 
 def new_pack(
     settings: Settings,
@@ -140,16 +272,8 @@ def new_pack(
     slow_fit = None
     if estimator.identifying and settings.identifier.pack_model:
         slow_fit = SlowFit(estimator, submit=submit, on_failure=on_failure)
-    forecaster = make_forecaster(settings, model, estimator)
+    forecaster = None
+    if estimator.identifying and isinstance(model, CellModel):
+        cutoff_v = load_cutoff_v(settings, model)
+        forecaster = Forecaster(estimator, cutoff_v=cutoff_v, limits=power_limits(settings, model))
     return Pack(estimator, slow_fit, CellEstimator(estimator), forecaster, has_forecasts=has_forecasts)
-
-
-def make_forecaster(settings: Settings, model: PackModel, estimator: Estimator) -> Forecaster | None:
-    """Return the forecaster of an estimator; None for a fuel cell, and without the identifier.
-
-    Raises:
-        UserError: The cut-off voltage is not below the voltage of the full pack.
-    """
-    if not (estimator.identifying and isinstance(model, CellModel)):
-        return None
-    return Forecaster(estimator, cutoff_v=load_cutoff_v(settings, model), limits=power_limits(settings, model))

@@ -8,19 +8,8 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import MIN_BIAS_OF_R_STD, MIN_SOC_STD
-from bms_estimator.kernels.kalman_filter.ekf import MAX_SOC, MIN_SOC
-from bms_estimator.kernels.kalman_filter.mixture import clear_hypothesis, copy_hypothesis, mixture_moments
-from bms_estimator.kernels.kalman_filter.records import (
-    HYPOTHESES,
-    LN_Q,
-    LN_R,
-    LN_R0,
-    NODE,
-    NODES,
-    OFFSET,
-    SOC,
-    Noise,
-)
+from bms_estimator.estimator.fitted_state import FittedState
+from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
@@ -39,14 +28,19 @@ MIN_R_STD = Noise.r_std
 MIN_SOC_STD_FRACTION = 0.55
 """Minimum std of the published SOC after a fit, as a fraction of the minimum with the curves of the cell file. Assumed: a fitted
 pack is known better than a cell that was not measured."""
-FILTER_STATES = np.array([SOC, LN_Q, OFFSET, *range(NODE, NODE + NODES)])
-"""States of the filter that a fit determines jointly."""
 FIT_RESULTS = np.array([FIT_SOC, FIT_LN_Q, FIT_OFFSET, *range(FIT_CURVE.start, FIT_CURVE.stop)])
 """Results of a fit in the order of ``FILTER_STATES``."""
-FIRST_PARAMETER = 1
-"""Position in ``FILTER_STATES`` of the first state after the SOC."""
 MIN_SLOPE_V = 1e-3
 """Minimum slope of the fitted OCV of one cell [V per unit SOC], because a slope of 0 has no inverse."""
+
+
+def use_fitted_curves(estimator: Estimator, fit: PackFit | None) -> None:
+    """Let the filter use the curves of a fit; None: those of the cell file."""
+    settings = cell_file = estimator.cell_file_settings
+    if fit is not None:
+        settings = estimator.settings_record[0]["filter"].copy()
+        adopt_curves(settings, cell_file, fit)
+    estimator.use_curves(settings)
 
 
 def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
@@ -107,46 +101,21 @@ def r_std(fit: PackFit) -> float:
 
 
 def adopt_state(estimator: Estimator, fit: PackFit) -> None:
-    """Write SOC, offset, capacity and their covariances with the curve to the filter's state.
+    """Hand SOC, offset, capacity and their covariances with the curve to the filter, whose settings have the fitted curves.
 
     After a gap since the fit's last row each hypothesis of the filter keeps its SOC.
     """
-    f, h = estimator.record[0]["filter"], estimator.record[0]["history"]
-    p = estimator.settings_record[0]["filter"]
-    f["learned_soc"] = p["learning_soc"]  # the first pass is complete: voltages change neither capacity nor curve
-    if h["segment"] != fit.segment:
-        for q in range(int(f["count"])):
-            _adopt_parameters(f["mean"][q], f["covariance"][q], fit, p, FIRST_PARAMETER)
-        return
-    if f["best"] != 0:
-        copy_hypothesis(f, int(f["best"]), 0)
+    h, p = estimator.record[0]["history"], estimator.settings_record[0]["filter"]
     drawn_soc = (h["charge_as"] - fit.charge_as) / p["capacity_as"] * np.exp(-fit.mean[FIT_LN_Q])
-    f["mean"][0][SOC] = np.clip(fit.mean[FIT_SOC] - drawn_soc, MIN_SOC, MAX_SOC)
-    _adopt_parameters(f["mean"][0], f["covariance"][0], fit, p, 0)
-    f["count"], f["best"], f["ln_weight"][0] = 1, 0, 0.0
-    for q in range(1, HYPOTHESES):
-        clear_hypothesis(f, q)
-    mixture_moments(f)
-    estimator.state["soc"] = f["soc"]
-
-
-def _adopt_parameters(mean: Floats, covariance: Floats, fit: PackFit, p: np.void, first: int) -> None:
-    """Write offset, capacity, curve and scales of the resistances, with their covariance, to one hypothesis.
-
-    Args:
-        mean: Mean of the hypothesis; written.
-        covariance: Covariance of the hypothesis; written.
-        fit: Fit of the history.
-        p: Record of dtype EKF_SETTINGS with the fitted curves.
-        first: First of ``FILTER_STATES`` whose covariance is written: 0 includes the SOC.
-    """
-    mean[LN_Q], mean[OFFSET] = fit.mean[FIT_LN_Q], fit.mean[FIT_OFFSET] * p["capacity_as"] / HOUR_S
-    mean[NODE : NODE + NODES] = mean[LN_R0] = mean[LN_R] = 0.0  # the settings contain the fitted curves
-    states = FILTER_STATES[first:]
-    _decouple(covariance, [*states, LN_R0, LN_R])
-    covariance[np.ix_(states, states)] = _state_covariance(fit, p)[first:, first:]
-    covariance[SOC, SOC] = max(covariance[SOC, SOC], float(p["min_soc_std"]) ** 2)
-    covariance[LN_R0, LN_R0] = covariance[LN_R, LN_R] = float(p["r_std"]) ** 2
+    estimator.adopt(
+        FittedState(
+            soc=fit.mean[FIT_SOC] - drawn_soc if h["segment"] == fit.segment else None,
+            ln_q=fit.mean[FIT_LN_Q],
+            offset_a=fit.mean[FIT_OFFSET] * p["capacity_as"] / HOUR_S,
+            covariance=_state_covariance(fit, p),
+            is_exchanged=fit.is_exchanged,
+        )
+    )
 
 
 def _state_covariance(fit: PackFit, p: np.void) -> Floats:
@@ -159,9 +128,3 @@ def _state_covariance(fit: PackFit, p: np.void) -> Floats:
 def series_curve_std(p: np.void) -> Floats:
     """Return the std of the OCV nodes of the pack [V]."""
     return np.asarray(np.sqrt(float(p["learned"])) * p["curve_error_v"])
-
-
-def _decouple(covariance: Floats, states: list[int]) -> None:
-    """Set rows and columns of a covariance to 0."""
-    covariance[states, :] = 0.0
-    covariance[:, states] = 0.0

@@ -10,15 +10,12 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
-from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD
-from bms_estimator.kernels.kalman_filter.input_checks import store_last_good_state
 from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.curve_change import keep_series_resistance, present_ohm, return_to_cell_file
 from bms_estimator.pack_model.fit import SOC as FIT_SOC
 from bms_estimator.pack_model.fit import PackFit, fit
-from bms_estimator.pack_model.handover import adopt_curves, adopt_state
+from bms_estimator.pack_model.handover import adopt_state, use_fitted_curves
 from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.resume import resume_history
 
@@ -124,8 +121,7 @@ class SlowFit:
         self._is_late = False
         self._new_rows = 0  # number of rows since the last fit
         self.saved_fit: PackFit | None = None
-        h = self._h
-        h["enabled"], h["event_s"] = 1, self._interval()
+        estimator.schedule(self._interval())
 
     def advance(self) -> None:
         """Take completed rows, and begin or end a fit that is due. Call it each time ``Estimator.run_part`` stops."""
@@ -154,10 +150,9 @@ class SlowFit:
             gap_s: Time since the state was saved [s]; infinite if unknown.
             restored: True if the state was restored. Otherwise the last fit supplies the curves.
         """
-        h, f = self._h, self.estimator.record[0]["filter"]
         if not restored and self.saved_fit is not None:
             self._adopt_curves(self.saved_fit)
-        resume_history(h, f, self.history, gap_s, self.cell.capacity_as, restored=restored)
+        resume_history(self.estimator, self.history, gap_s, self.cell.capacity_as, restored=restored)
         self._schedule_after_restart(restored=restored)
 
     def _schedule_after_restart(self, *, restored: bool) -> None:
@@ -166,11 +161,11 @@ class SlowFit:
         fitted_s = -math.inf if saved is None else saved.elapsed_s
         self._new_rows = int((self.history.rows["elapsed_s"] > fitted_s).sum())
         next_s = float(h["event_s"]) if restored else math.inf
-        h["enabled"], h["event_s"] = 1, min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self._interval())
+        self.estimator.schedule(min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self._interval()))
         is_adopted = restored and self.fit is not None and saved is not None and self.fit.elapsed_s >= saved.elapsed_s
         if saved is not None and not is_adopted:
             self._pending = run_now(lambda: saved)
-            h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
+            self.estimator.schedule(h["elapsed_s"] + ADOPT_DELAY_S)
 
     def forget(self) -> None:
         """Discard history and fit, and restart the estimator with the curves of the cell file, as for a new pack."""
@@ -178,9 +173,8 @@ class SlowFit:
         self.history, self._is_late, self._new_rows, self.unsaved_rows = History(), False, 0, 0
         if self.bank:
             self.bank.reset()
-        return_to_cell_file(self.estimator)
-        self.estimator.restart()
-        self._h["enabled"], self._h["event_s"] = 1, self._interval()
+        self.estimator.forget()
+        self.estimator.schedule(self._interval())
         self.revision += 1
 
     def adopt(self, fitted: PackFit) -> None:
@@ -189,9 +183,6 @@ class SlowFit:
         before = float(estimator.state["soc"][0]), relative_capacity(record).value
         self._adopt_curves(fitted)
         adopt_state(estimator, fitted)
-        if fitted.is_exchanged:
-            record["filter"]["exchanged"] = 1  # raises the input diagnostic of an exchange
-        store_last_good_state(record["checks"], record["filter"])
         self.fits += 1
         self.saved_fit = fitted
         after = float(estimator.state["soc"][0]), relative_capacity(record).value
@@ -201,11 +192,8 @@ class SlowFit:
 
     def take_rows(self) -> None:
         """Append the completed rows of the estimator's state to the history. An exception discards the history."""
-        h = self._h
-        if count := int(h["count"]):
-            rows = h["rows"][:count].copy()
-            h["count"] = 0
-            h["rows"] = np.zeros(1, HISTORY_ROW)  # unused rows would depend on the division of the samples into blocks
+        rows = self.estimator.take_rows()
+        if rows.size:
             try:
                 self._append(rows)
             except Exception as error:  # noqa: BLE001 - an odd value of the history must not end the estimator
@@ -252,7 +240,7 @@ class SlowFit:
         elif self._pending.done():
             self._end_fit(self._pending)
             self._pending, self._is_late = None, False
-            h["event_s"] += self._interval() - ADOPT_DELAY_S
+            self.estimator.schedule(h["event_s"] + (self._interval() - ADOPT_DELAY_S))
         elif not self._is_late:  # ``event_s`` does not change, so that this function runs again after the next sample
             self.late += 1
             self._is_late = True
@@ -264,9 +252,9 @@ class SlowFit:
         if self._has_grown() and unknown_current(rows) <= MAX_UNKNOWN_CURRENT:
             self._new_rows = 0
             self._pending = self._submit(lambda: fit(self.cell, rows, previous))
-            h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
+            self.estimator.schedule(h["elapsed_s"] + ADOPT_DELAY_S)
             return
-        h["event_s"] = h["elapsed_s"] + self._interval()
+        self.estimator.schedule(h["elapsed_s"] + self._interval())
         if self.unsaved_rows:
             self.unsaved_rows = 0
             self.revision += 1
@@ -281,14 +269,15 @@ class SlowFit:
     def _end_fit(self, done: "Future[PackFit]") -> None:
         """Adopt the result of a completed fit if it is ready for use, or report its failure."""
         estimator = self.estimator
-        before = estimator.record.copy(), estimator.settings_record.copy(), self.fit
+        before, fit_before = (estimator.record.copy(), estimator.settings_record.copy()), self.fit
         try:
             fitted = done.result()
             if self._is_adoptable(fitted):
                 self.adopt(fitted)
             self.saved_fit, self._successive_failures = fitted, 0
         except Exception as error:  # noqa: BLE001 - a failed fit must not end the estimator
-            estimator.record[...], estimator.settings_record[...], self.fit = before
+            estimator.load_exact(*before)
+            self.fit = fit_before
             self._successive_failures += 1
             self._report_failure(error)
             if self._successive_failures == MAX_FAILED_FITS:
@@ -311,15 +300,8 @@ class SlowFit:
 
     def _adopt_curves(self, fitted: PackFit | None) -> None:
         """Write the curves of a fit, or of the cell file, to the filter's settings."""
-        self.fit, settings = fitted, self.estimator.settings_record["filter"]
-        f = self.estimator.record[0]["filter"]
-        before = present_ohm(settings[0], f)
-        if fitted is None:
-            settings[0] = self.estimator.cell_file_settings
-        else:
-            adopt_curves(settings[0], self.estimator.cell_file_settings, fitted)
-        if f["started"]:
-            keep_series_resistance(f, before, present_ohm(settings[0], f))
+        self.fit = fitted
+        use_fitted_curves(self.estimator, fitted)
 
 
 def unknown_current(rows: NDArray[np.void]) -> float:

@@ -8,44 +8,35 @@ import math
 
 import numpy as np
 
-from bms_estimator.kernels.accumulators.history import HISTORY_ROW, complete_row
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.pack_model.history import History
 
 
-def resume_history(
-    h: np.void, f: np.void, history: History, gap_s: float, capacity_as: float, *, restored: bool
-) -> None:
+def resume_history(estimator: Estimator, history: History, gap_s: float, capacity_as: float, *, restored: bool) -> None:
     """Append the checkpoint's rows that are not in the saved history, and begin a segment with an unused number.
 
     Args:
-        h: Record of dtype HISTORY: restored from a checkpoint, or new.
-        f: Record of dtype EKF_STATE, restored or new.
+        estimator: Estimator of the pack, restored from a checkpoint, or new.
         history: Saved rows.
         gap_s: Time since the checkpoint was saved [s]; infinite if unknown.
         capacity_as: Declared capacity [A s].
-        restored: True if ``h`` and ``f`` are restored.
+        restored: True if the estimator is restored.
     """
     if not restored and not history.rows.size:
         return  # the first start
-    is_linked = restored and _append_saved(h, f, history, capacity_as)
+    is_linked = restored and _append_saved(estimator, history, capacity_as)
     rows = history.rows
-    if rows.size:
-        h["elapsed_s"] = max(h["elapsed_s"], rows["elapsed_s"][-1])
-        h["segment"] = max(h["segment"], rows["segment"][-1])
-    h["segment"] += 1
-    h["gap_s"] = gap_s if is_linked else math.inf
-    h["count"] = h["direction"] = 0
-    h["charge_as"] = h["charge_variance_as2"] = h["throughput_soc"] = h["direction_s"] = h["row_as"] = 0.0
-    h["hysteresis"] = 0.0
+    elapsed_s, segment = (rows["elapsed_s"][-1], rows["segment"][-1]) if rows.size else (0.0, 0.0)
+    estimator.begin_segment(elapsed_s, segment, gap_s if is_linked else math.inf)
 
 
-def _append_saved(h: np.void, f: np.void, history: History, capacity_as: float) -> bool:
+def _append_saved(estimator: Estimator, history: History, capacity_as: float) -> bool:
     """Append the checkpoint's rows that are not in the saved history, and a row with its counted charge.
 
     Return True if the charge was counted without interruption up to the checkpoint.
     """
-    complete_row(h)
-    rows = h["rows"][: int(h["count"])].copy()
+    rows, h = estimator.complete_rows(), estimator.record[0]["history"]
     if history.rows.size:
         last = history.rows[-1]
         if last["segment"] > h["segment"]:
@@ -57,7 +48,7 @@ def _append_saved(h: np.void, f: np.void, history: History, capacity_as: float) 
     elif not rows.size:
         return False
     history.append(rows, capacity_as)
-    history.append(_row_at_checkpoint(h, f, history.rows[-1]), capacity_as)
+    history.append(_row_at_checkpoint(h, estimator.record[0]["filter"], history.rows[-1]), capacity_as)
     return True
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.estimator.history_rows import CHARGE, SEGMENT, TIME, checked_rows, is_within
 from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID
@@ -24,46 +24,13 @@ SAVED_MINIMA = 2
 """Number of a fit's minima that are saved. The next fit starts from two minima (``fit.starts``)."""
 _RESULTS = CURVE.stop
 """Number of results of a fit. ``CURVE`` is the last part of them."""
-MAX_TIME_S = 1e11
-"""Maximum plausible time since the history began [s], 3,000 years."""
-MAX_SEGMENT = 1e9
-"""Maximum plausible number of a segment. Each restart and each gap begin one."""
-MAX_CHARGE_AS = 1e12
-"""Maximum plausible absolute charge counter [A s]."""
-MAX_VOLTAGE_V, MAX_CURRENT_A, MAX_TEMPERATURE_C = 1e5, 1e6, 1e3
-"""Maximum plausible absolute values of a pack's voltage [V], current [A] and temperature [degC]."""
-_FILTER_SOC = (-0.1, 1.1)
-"""Plausible range of an SOC of the filter, which limits it to -0.05..1.05."""
 _FITTED_SOC = (-2.0, 3.0)
 """Plausible range of a fitted SOC, which the fit does not limit."""
 MAX_RESULT = 20.0
 """Maximum plausible absolute value of a result of a fit: an SOC, a voltage of one cell [V], or ln of a ratio."""
 MAX_COST = 1e15
 """Maximum plausible absolute cost of a fit."""
-ROUNDING_S = 1.0
-"""Maximum decrease of the time between two rows by the rounding of merged rows [s]."""
-_TIME, _SEGMENT, _CHARGE = (0.0, MAX_TIME_S), (0.0, MAX_SEGMENT), (-MAX_CHARGE_AS, MAX_CHARGE_AS)
-_CURRENT, _VARIANCE, _RESULT = (-MAX_CURRENT_A, MAX_CURRENT_A), (0.0, MAX_CURRENT_A**2), (-MAX_RESULT, MAX_RESULT)
-_ROW_RANGES = {
-    "elapsed_s": _TIME,
-    "duration_s": _TIME,
-    "segment": _SEGMENT,
-    "direction": (-1.0, 1.0),
-    "voltage_v": (-MAX_VOLTAGE_V, MAX_VOLTAGE_V),
-    "current_a": _CURRENT,
-    "between_a2": _VARIANCE,
-    "skew_a2": _VARIANCE,
-    "x_a": _CURRENT,
-    "settled_s": _TIME,
-    "temperature_c": (-MAX_TEMPERATURE_C, MAX_TEMPERATURE_C),
-    "charge_as": _CHARGE,
-    "charge_variance_as2": (0.0, MAX_CHARGE_AS**2),
-    "throughput_soc": (0.0, MAX_CHARGE_AS),
-    "hysteresis": (-1.001, 1.001),  # a mean of values of -1 may be rounded
-    "soc": _FILTER_SOC,
-    "reference_kind": (0.0, 2.0),
-}
-"""Range of each field of a row that is always finite."""
+_RESULT = (-MAX_RESULT, MAX_RESULT)
 _SHAPES = {
     "elapsed_s": (),
     "segment": (),
@@ -78,17 +45,17 @@ _SHAPES = {
 }
 """Fields of a fit on which the curves and the handed-over state depend, with their shapes."""
 _FIT_RANGES = {
-    "elapsed_s": _TIME,
-    "segment": _SEGMENT,
-    "charge_as": _CHARGE,
+    "elapsed_s": TIME,
+    "segment": SEGMENT,
+    "charge_as": CHARGE,
     "mean": _RESULT,
     "covariance": (-(MAX_RESULT**2), MAX_RESULT**2),
     "curve_v": _RESULT,
     "ln_r": _RESULT,
     "hysteresis": (0.0, math.exp(MAX_RESULT)),
     "cost": (-MAX_COST, MAX_COST),
-    "first_segment": _SEGMENT,
-    "row_elapsed_s": _TIME,
+    "first_segment": SEGMENT,
+    "row_elapsed_s": TIME,
     "row_soc": _FITTED_SOC,
     "curves": (-MAX_COST, MAX_COST),
 }
@@ -136,14 +103,9 @@ def _fit_field(arrays: Arrays, name: str) -> Floats:
         ValueError: The field is missing or has an implausible value.
     """
     value = arrays.get(name)
-    if value is None or value.dtype.kind not in "fiu" or not _is_within(value, _FIT_RANGES[name]):
+    if value is None or value.dtype.kind not in "fiu" or not is_within(value, _FIT_RANGES[name]):
         raise ValueError(f"{name} of the fit is missing or damaged")
     return value.astype(float)
-
-
-def _is_within(values: NDArray[Any], limits: tuple[float, float]) -> bool:
-    """Return True if no value is NaN or outside the limits."""
-    return bool(((values >= limits[0]) & (values <= limits[1])).all())
 
 
 def neutral_fit() -> PackFit:
@@ -173,7 +135,7 @@ def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
     if saved is None or saved.dtype != float or saved.ndim != 2 or saved.shape[1] != len(WeakCellTime._fields):
         raise ValueError("the times of weak cells are damaged")
     start_s, end_s, soc = saved.T
-    if not (_is_within(start_s, _TIME) and (end_s >= start_s).all() and _is_within(soc, _FITTED_SOC)):
+    if not (is_within(start_s, TIME) and (end_s >= start_s).all() and is_within(soc, _FITTED_SOC)):
         raise ValueError("the times of weak cells are damaged")
     return [WeakCellTime(*row) for row in saved.tolist()]
 
@@ -181,31 +143,14 @@ def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
 def _first_discharges(arrays: Arrays) -> ReferenceDischarges | None:
     """Return the first discharges of a bank; None if none were saved."""
     fit = fit_of_curves({name: arrays[BANK + name] for name in _SHAPES if BANK + name in arrays})
-    return None if fit is None else ReferenceDischarges(checked_rows(arrays.get("bank_rows")), fit)
+    return None if fit is None else ReferenceDischarges(_rows(arrays, "bank_rows"), fit)
 
 
-def checked_rows(rows: NDArray[Any] | None) -> NDArray[np.void]:
-    """Return saved rows.
-
-    Raises:
-        ValueError: They have another layout, an implausible value, or are not in the order of time.
-    """
-    if rows is None or rows.dtype != HISTORY_ROW or rows.ndim != 1 or rows.size > MAX_ROWS:
-        raise ValueError("its rows have another layout")
-    for name, limits in _ROW_RANGES.items():
-        if not _is_within(rows[name], limits):
-            raise ValueError(f"{name} of a row is damaged")
-    for name in ("segment", "direction", "reference_kind"):
-        if (rows[name] % 1.0).any():
-            raise ValueError(f"{name} of a row is damaged")
-    soc, std = rows["reference_soc"], rows["reference_std"]
-    known = ~np.isnan(soc)
-    if not (_is_within(soc[known], _FILTER_SOC) and ((std[known] > 0.0) & (std[known] <= 1.0)).all()):
-        raise ValueError("a known SOC of a row is damaged")
-    if not (rows["gap_s"] >= 0.0).all():
-        raise ValueError("gap_s of a row is damaged")
-    if (np.diff(rows["segment"]) < 0.0).any() or (np.diff(rows["elapsed_s"]) < -ROUNDING_S).any():
-        raise ValueError("its rows are not in the order of time")
+def _rows(arrays: Arrays, name: str) -> NDArray[np.void]:
+    """Return saved rows of a history."""
+    rows = checked_rows(arrays.get(name))
+    if rows.size > MAX_ROWS:
+        raise ValueError("it has too many rows")
     return rows
 
 
@@ -215,7 +160,7 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
     Raises:
         ValueError: A field is missing, or has another layout or an implausible value.
     """
-    history = History(checked_rows(arrays.get("rows")), _weak_cell_times(arrays), _first_discharges(arrays))
+    history = History(_rows(arrays, "rows"), _weak_cell_times(arrays), _first_discharges(arrays))
     fit = fit_of_curves({name: value for name, value in arrays.items() if name in _SHAPES})
     if fit is None:
         return history, None

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.store.minute import epoch_s
@@ -30,6 +31,9 @@ SET_BACK_S = 60.0
 """Maximum lead of a stored state over both the wall clock and the next state [s]. A state with a larger lead is removed,
 because its clock was wrong."""
 RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
+
+_STORED_FIELDS = {STATE: {"time", *RECENT_FIELDS}, PARAMETERS: {"soc", "elements"}}
+"""Fields of the topics that are stored for the curves."""
 
 _Row = tuple[float, tuple[float | None, ...]]
 """Time [s since 1970] and values of ``RECENT_FIELDS``."""
@@ -60,14 +64,16 @@ class PackTopics(LatestValues):
         Args:
             pack: Name of the pack.
             topic: Topic relative to that of the pack.
-            value: Parsed JSON payload, or text; None: the topic was cleared.
+            value: Payload, whose JSON is shown as it is; parsed JSON, or text; None: the topic was cleared.
         """
         if topic not in SHOWN_TOPICS and not topic.startswith(ALARM):
             return
         try:
-            text = _json(value)
+            text = value.json_bytes.decode() if isinstance(value, Payload) else _json(value)
         except RecursionError:  # nested too deeply, from another publisher
             return
+        if isinstance(value, Payload):
+            value = value.model_dump(include=_STORED_FIELDS.get(topic, set()))
         if value is None:
             self._remove_topic(pack, topic)
         else:

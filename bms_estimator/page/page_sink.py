@@ -1,4 +1,4 @@
-"""Sink that shows a service's packs on the page, as the payloads of MQTT. Packs with one address share a server."""
+"""Sink that shows a service's packs on the page, by the payloads of MQTT. Packs with one address share a server."""
 
 import asyncio
 import contextlib
@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Self
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.events import events
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.topic_cache import parse_payload
 from bms_estimator.page.history_query import HistoryQuery
-from bms_estimator.page.pack_topics import PackTopics
+from bms_estimator.page.pack_topics import STATE, PackTopics
 from bms_estimator.page.page_server import Forecast, PageServer
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
+from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, changed_payloads
 
 
 class PageSink:
@@ -38,9 +37,7 @@ class PageSink:
     ) -> None:
         self._pages, self._settings, self._pack, self._history = pages, settings, pack, history
         self._forecast = forecast
-        self._messages = MessageBuilder("", pack)
         self._previous: Snapshot | None = None
-        self._sent = PublishedState()
         self._hub = PackTopics()
         self._stack = contextlib.AsyncExitStack()
 
@@ -49,26 +46,25 @@ class PageSink:
         self._hub = await self._stack.enter_async_context(
             self._pages.serving(self._settings, self._pack, self._history, self._forecast)
         )
-        self._put(self._messages.birth_messages())
+        self._hub.put(self._pack, AVAILABILITY, "online")
         return self
 
     async def __aexit__(self, *_: object) -> None:
         """Close the streams of all browsers."""
-        self._put(self._messages.offline_messages())
+        for topic in (SENSOR_AVAILABILITY, AVAILABILITY):
+            self._hub.put(self._pack, topic, "offline")
         await self._stack.aclose()
 
     def publish(self, snapshot: Snapshot) -> None:
         """Store a snapshot for the page, without blocking."""
-        now_s = asyncio.get_running_loop().time()
-        messages, self._sent = self._messages.live_messages(self._sent, snapshot, now_s)
-        self._put(self._messages.guaranteed_messages(self._previous, snapshot) + messages)
+        for event in events(self._previous, snapshot):
+            self._hub.put(self._pack, "event", event)
+        if snapshot.estimate:
+            self._hub.put(self._pack, STATE, snapshot.estimate)
+        for topic, payload in changed_payloads(self._previous, snapshot):
+            self._hub.put(self._pack, topic, payload)
+        self._hub.put(self._pack, SENSOR_AVAILABILITY, "online" if snapshot.health.sensor_online else "offline")
         self._previous = snapshot
-
-    def _put(self, messages: list[Message]) -> None:
-        root = f"{self._messages.root}/"
-        for message in messages:
-            if message.topic.startswith(root):
-                self._hub.put(self._pack, message.topic.removeprefix(root), parse_payload(message.payload))
 
 
 class Pages:

@@ -12,12 +12,12 @@ from typing import TypeVar
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointFile
-from bms_estimator.checkpoint.history_file import HistoryFile
 from bms_estimator.checkpoint.run_file import RunCounters
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.pack.pack import Pack
+from bms_estimator.pack.state import REFUSED
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.alarm_hooks import AlarmHooks
@@ -53,9 +53,8 @@ class CheckpointWriter:
 
     Args:
         pack: The pack; read only.
-        checkpoint: Destination of the state.
-        history: File of the history, which is saved when the ``revision`` of the slow fit changes; None: it is not saved.
-        load_file: File of the observed load, which is saved every ``LOAD_SAVE_S``; None: it is not saved.
+        files: Files of the state. The history is saved when the ``revision`` of the slow fit changes, and the observed load
+            every ``LOAD_SAVE_S``.
         alarms: Monitor of the alarms.
         totals: Totals over restarts.
         hooks: Alarm hooks; read only.
@@ -67,9 +66,7 @@ class CheckpointWriter:
     def __init__(
         self,
         pack: Pack,
-        checkpoint: CheckpointFile,
-        history: HistoryFile | None,
-        load_file: HistoryFile | None,
+        files: StateFiles,
         *,
         alarms: AlarmMonitor,
         totals: LifetimeTotals,
@@ -78,7 +75,7 @@ class CheckpointWriter:
         status: ServiceStatus,
         interval_s: float,
     ) -> None:
-        self._pack, self._checkpoint, self._history, self._load_file = pack, checkpoint, history, load_file
+        self._pack, self._files = pack, files
         self._monitor, self._totals, self._hooks, self._slots = alarms, totals, hooks, slots
         self._status, self._interval_s = status, interval_s
         self._samples_of_saved_load = 0
@@ -117,7 +114,7 @@ class CheckpointWriter:
                 load_tried_s = loop.time()
 
     def _raise_state_lost(self) -> None:
-        name = self._checkpoint.run_file.path.name
+        name = self._files.run_file.path.name
         self._monitor.raise_state_lost(f"{name} cannot be written, so that a restart loses alarms")
 
     async def _wait_for_alarm(self, pause_s: float) -> None:
@@ -141,7 +138,7 @@ class CheckpointWriter:
                 await self._save_history(is_last=True)
                 await self._save_load()
         except TimeoutError:
-            log.warning("the disk hangs: the last checkpoint is not written", file=str(self._checkpoint.path))
+            log.warning("the disk hangs: the last checkpoint is not written", file=str(self._files.checkpoint.path))
 
     @property
     def _fit(self) -> PackFit | None:
@@ -183,7 +180,7 @@ class CheckpointWriter:
 
     async def _is_run_file_missing(self) -> bool:
         """Return True if the file with counters and alarms was deleted."""
-        path = self._checkpoint.run_file.path
+        path = self._files.run_file.path
         return not await self._call_disk(lambda: os.path.exists(path), path)  # noqa: PTH110 - False if it cannot be read
 
     async def _save_counters(self, *, clean: bool = False) -> bool:
@@ -191,7 +188,7 @@ class CheckpointWriter:
         hooks = self._hooks.finished_hashes if clean else None  # after a crash all hooks repeat their jobs
         alarms, slots = self._alarms.saved_state, self._slots.known
         counters = RunCounters(self._status.restarts, self._totals.total, clean, alarms, hooks, slots)
-        file = self._checkpoint.run_file
+        file = self._files.run_file
         if counters == self._saved_counters:
             return True
         if not await self._write(lambda: file.save(counters), file.path):
@@ -214,27 +211,26 @@ class CheckpointWriter:
             return True
         state, fit = self._pack.estimator.record.copy(), self._fit
         curves, cells = curve_arrays(fit), self._pack.cells.saved_state if self._pack.cells else None
-        if not await self._write(lambda: self._checkpoint.save(state, curves, cells, whole=whole)):
+        if not await self._write(lambda: self._files.checkpoint.save(state, curves, cells, whole=whole)):
             return False
         self._status.checkpoint, self._saved_progress, self._saved_fit = "saved", progress, fit
         return True
 
     async def _save_history(self, *, is_last: bool = False) -> bool:
         """Save the history if its revision has changed, or at the end. Return False if it cannot be written."""
-        model, file = self._pack.slow_fit, self._history
+        model, file = self._pack.slow_fit, self._files.history
         if model is None:
             return True
         if is_last:
             model.take_rows()
         revision = model.revision
-        if file is None or (revision == self._saved_revision and not (is_last and model.unsaved_rows)):
-            self._saved_revision = revision
+        if revision == self._saved_revision and not (is_last and model.unsaved_rows):
             return True
         arrays, discarded = history_arrays(model.history, model.saved_fit), model.discarded
 
         def save() -> None:
             if discarded != self._discarded and file.path.exists():
-                log.warning("history", file=str(file.path), outcome=f"{REJECTED}its fit fails; {file.quarantine()}")
+                log.warning("history", file=str(file.path), outcome=f"{REFUSED}its fit fails; {file.quarantine()}")
             file.save(arrays)
 
         if await self._write(save, file.path):
@@ -244,8 +240,8 @@ class CheckpointWriter:
 
     async def _save_load(self) -> None:
         """Save the observed load, if there are new samples."""
-        samples, forecaster, file = self._progress[0], self._pack.forecaster, self._load_file
-        if forecaster is None or file is None or samples == self._samples_of_saved_load:
+        samples, forecaster, file = self._progress[0], self._pack.forecaster, self._files.load
+        if forecaster is None or samples == self._samples_of_saved_load:
             return
         arrays = load_arrays(forecaster.load, forecaster.past)
         if await self._write(lambda: file.save(arrays), file.path):
@@ -258,10 +254,10 @@ class CheckpointWriter:
 
     async def _write(self, write: Callable[[], None], path: Path | None = None) -> bool:
         """Call ``write``, which writes ``path`` or the checkpoint, in the disk's thread. Return False if it fails."""
-        file = path or self._checkpoint.path
+        file = path or self._files.checkpoint.path
         try:
             await self._call_disk(write, file)
-            self._status.disk_free_mib = self._checkpoint.disk_free_mib
+            self._status.disk_free_mib = self._files.checkpoint.disk_free_mib
         except OSError as error:
             self._status.checkpoint = f"cannot be saved: {error}"
             log.warning("checkpoint cannot be saved", file=str(file), error=str(error))
@@ -270,7 +266,7 @@ class CheckpointWriter:
 
     async def _call_disk(self, call: Callable[[], T], file: Path) -> T:
         """Call a function that accesses ``file`` in the disk's thread. Report a disk that hangs."""
-        future = asyncio.get_running_loop().run_in_executor(self._checkpoint.thread, call)
+        future = asyncio.get_running_loop().run_in_executor(self._files.thread, call)
         # asyncio.wait_for of Python 3.11 may swallow a cancellation
         await asyncio.wait({future}, timeout=DISK_HUNG_S)
         if not future.done():

@@ -15,7 +15,6 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.curve_change import return_to_cell_file
 from bms_estimator.pack_model.fit import fit
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import neutral_fit
@@ -64,7 +63,7 @@ def _call_kernels() -> None:
     make_parameters_payload(estimator, 0.0)
     SlowFit(estimator).adopt(neutral_fit())
     _load_fit_kernels(estimator)
-    return_to_cell_file(estimator)
+    estimator.return_to_cell_file()
     remaining_capacity_ah(estimator)
     load_forecast_kernels()
     _ = FrameDecoder().clock_ppm

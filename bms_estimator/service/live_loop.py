@@ -5,15 +5,14 @@ import contextlib
 import math
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import Executor
+from dataclasses import dataclass, field
 
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import HistoryFile
-from bms_estimator.checkpoint.load_file import restore_seen_load
+from bms_estimator.checkpoint.run_file import RunCounters, SavedRun
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
-from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.fuel_cell import PackModel
@@ -27,13 +26,12 @@ from bms_estimator.service.checkpoint_writer import CheckpointWriter
 from bms_estimator.service.fit_thread import FitThread
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.request_handlers import RequestHandlers
-from bms_estimator.service.restored_pack import read_counters, restore_pack
 from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import Source
-from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
+from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
 
 LAG_STEP_S = 0.1
 """Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""
@@ -43,62 +41,65 @@ STATUS_S = 60.0
 log = structlog.get_logger(__name__)
 
 
+@dataclass(frozen=True)
+class ServiceParts:
+    """Optional parts of a service around its live loop."""
+
+    status: ServiceStatus = field(default_factory=ServiceStatus)
+    """State of the service around the pack; the loop adds its own parts."""
+    requests: RequestDispatcher | None = None
+    """Dispatcher at which the loop registers its handlers."""
+    current_zero: Callable[[], Awaitable[None]] | None = None
+    """Makes the board store the present current as zero; None: the source has no such command."""
+    notifier: SystemdNotifier | None = None
+    """Is notified that the loop is ready and alive."""
+    hooks: AlarmHooks | None = None
+    """Alarm hooks; opened and closed by the loop."""
+    edge: BlockSender | None = None
+    """Sender that also receives all samples. Its owner opens and closes it."""
+    fit_executor: Executor | None = None
+    """Runs the fits of the pack's model; None: a thread of their own."""
+
+
 async def run_estimation_loop(
     settings: Settings,
-    cell: PackModel,
+    model: PackModel,
     *,
     source: Source,
     sinks: Sequence[Sink],
     stop: asyncio.Event,
-    checkpoint: CheckpointFile | None = None,
-    requests: RequestDispatcher | None = None,
-    status: ServiceStatus | None = None,
-    current_zero: Callable[[], Awaitable[None]] | None = None,
-    notifier: SystemdNotifier | None = None,
+    files: StateFiles | None = None,
+    parts: ServiceParts | None = None,
     clock: Clock | None = None,
-    hooks: AlarmHooks | None = None,
-    edge: BlockSender | None = None,
-    history: HistoryFile | None = None,
-    load_file: HistoryFile | None = None,
-    fit_executor: Executor | None = None,
 ) -> Estimator:
     """Estimate until the source ends or ``stop`` is set.
 
     Args:
         settings: The pack's settings.
-        cell: Model of the whole pack.
+        model: Model of the whole pack.
         source: Supplies samples; opened and closed here.
         sinks: Destinations of the snapshots; opened and closed here.
         stop: Event that ends the loop cleanly.
-        checkpoint: File of the state; None: the state is not saved.
-        requests: Dispatcher at which this loop registers its handlers.
-        status: State of the service around the pack; this loop adds its own parts.
-        current_zero: Makes the board store the present current as zero; None: the source has no such command.
-        notifier: Is notified that the loop is ready and alive.
+        files: Files of the pack's state; None: it is not saved.
+        parts: Parts of the service; default: none.
         clock: The clocks.
-        hooks: Alarm hooks; opened and closed here.
-        edge: Sender that also receives all samples. Its owner opens and closes it. None: no sender.
-        history: File of the history and the last fit; None: they are not saved.
-        load_file: File of the observed load; None: it is not saved.
-        fit_executor: Runs the fits of the pack's model; None: a thread of their own.
 
     Returns:
         The estimator after the last sample.
     """
-    name, clock = settings.pack.name, clock or Clock()
-    hooks = hooks or AlarmHooks((), name, None, None)
-    notifier = notifier or SystemdNotifier([name])
-    fit_thread, status = FitThread(clock, fit_executor), status or ServiceStatus()
-    pack = new_pack(settings, cell, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
-    saved_run = read_counters(checkpoint, clock)
+    name, clock, parts = settings.pack.name, clock or Clock(), parts or ServiceParts()
+    hooks = parts.hooks or AlarmHooks((), name, None, None)
+    notifier = parts.notifier or SystemdNotifier([name])
+    fit_thread, status = FitThread(clock, parts.fit_executor), parts.status
+    pack = new_pack(settings, model, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
+    saved_run = files.read_counters() if files else SavedRun(RunCounters(0, new_totals(clock.wall())))
     counters = saved_run.counters
     status.hooks, status.fit_times, status.restarts = lambda: hooks.health, lambda: fit_thread.times, counters.restarts
-    status.checkpoint = restore_pack(pack, checkpoint, history)
+    if files:
+        status.checkpoint = files.restore(pack)
     restored_s = since_boot()
-    if pack.forecaster and load_file:
-        _restore_load(load_file, pack.forecaster)
-    if edge:
-        status.edge = edge.health
+    if parts.edge:
+        status.edge = parts.edge.health
     totals = LifetimeTotals(pack.estimator, counters.total)
     publisher = Publisher(
         settings,
@@ -119,15 +120,13 @@ async def run_estimation_loop(
         monitor.raise_state_lost(lost_reason)
     # with a raised alarm or a lost cell the slots of the earlier run, so that a floating slot does not replace this cell
     is_known = monitor.alarms.active or monitor.alarms.unwatched_critical
-    slots = CellSlots(cell.cell.series_count, counters.cell_slots if is_known else (), counters.cell_slots)
-    if requests is not None:
-        RequestHandlers(pack, publisher, current_zero).register(requests)
+    slots = CellSlots(model.cell.series_count, counters.cell_slots if is_known else (), counters.cell_slots)
+    if parts.requests is not None:
+        RequestHandlers(pack, publisher, parts.current_zero).register(parts.requests)
     writer = (
         CheckpointWriter(
             pack,
-            checkpoint,
-            history,
-            load_file,
+            files,
             alarms=monitor,
             totals=totals,
             hooks=hooks,
@@ -135,7 +134,7 @@ async def run_estimation_loop(
             status=status,
             interval_s=settings.state.checkpoint_s,
         )
-        if checkpoint
+        if files
         else None
     )
     async with contextlib.AsyncExitStack() as stack:
@@ -146,7 +145,7 @@ async def run_estimation_loop(
         stack.enter_context(acknowledge_on_signal(monitor.acknowledge_on_signal))
         notifier.ready(name)
         tasks = [
-            _estimate(source, pack, slots, totals, publisher, edge, restored_s),
+            _estimate(source, pack, slots, totals, publisher, parts.edge, restored_s),
             _keep_alive(publisher, status, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -188,8 +187,7 @@ async def _estimate(
         edge: Sender that receives all samples; None: no sender.
         restored_s: Time since boot at which the state was restored [s].
     """
-    estimator, logged_reason = pack.estimator, ""
-    unseen_s = estimator.record["unseen_s"].copy()
+    logged_reason, before_s = "", restored_s
     async for each in source:
         received = each._replace(cells_v=slots.select(each.cells_v))
         if slots.reason != logged_reason:
@@ -198,9 +196,9 @@ async def _estimate(
                 log.warning("no estimates of single cells", reason=logged_reason)
         if slots.moved:
             publisher.alarm_monitor.raise_state_lost(slots.moved)
-        if estimator.state["started"][0] and not estimator.state["samples"][0]:
-            # the gap before the first sample after a restart also includes the wait for that sample
-            estimator.record["unseen_s"] = unseen_s + since_boot() - restored_s
+        now_s = since_boot()
+        pack.waited(now_s - before_s)
+        before_s = now_s
         if edge:
             edge.take(received.samples, received.cells_v)
         publisher.alarm_monitor.check_silence()
@@ -236,12 +234,3 @@ async def _measure_lag(publisher: Publisher) -> None:
         due_s = loop.time() + LAG_STEP_S
         await asyncio.sleep(LAG_STEP_S)
         publisher.add_lag(loop.time() - due_s)
-
-
-def _restore_load(file: HistoryFile, forecaster: Forecaster) -> None:
-    """Restore the load that an earlier run observed. A damaged file is logged, and the next save replaces it."""
-    reason = restore_seen_load(file, forecaster)
-    if reason:
-        log.warning("the observed load is damaged and was not restored", file=str(file.path), reason=reason)
-    else:
-        log.info("load", file=str(file.path), seconds=forecaster.load.seconds)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.observer_conditions import observer_warnings
@@ -25,7 +24,7 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import has_relay
-from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.pack import Settings
@@ -126,9 +125,6 @@ async def run_pack_service(
                 partial(requests.handle, "forecast"),
             )
         )
-    checkpoint = CheckpointFile(folder, settings, cell) if folder else None
-    pack_history = HistoryFile(folder, settings, cell) if folder else None
-    load_file = HistoryFile(folder, settings, cell, LOAD_SUFFIX) if folder else None
     async with contextlib.AsyncExitStack() as stack:
         if folder:
             stack.enter_context(instance_lock(folder, settings.pack.name))
@@ -143,15 +139,15 @@ async def run_pack_service(
             source=source,
             sinks=all_sinks,
             stop=stop,
-            checkpoint=checkpoint,
-            requests=requests,
-            status=ServiceStatus(delivery, source.health, partial(recording_health, tap)),
-            current_zero=source.current_zero,
-            notifier=notifier,
-            hooks=hooks,
-            edge=edge,
-            history=pack_history,
-            load_file=load_file,
+            files=StateFiles(folder, settings, cell) if folder else None,
+            parts=ServiceParts(
+                ServiceStatus(delivery, source.health, partial(recording_health, tap)),
+                requests,
+                source.current_zero,
+                notifier,
+                hooks,
+                edge,
+            ),
         )
 
 

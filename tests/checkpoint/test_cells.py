@@ -5,27 +5,25 @@ from pathlib import Path
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.pack.pack import Pack
-from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
 from tests.simulated_pack import SimulatedPack
 
 
-def saved_checkpoint(folder: Path, pack: SimulatedPack) -> CheckpointFile:
-    """Save a checkpoint of a pack; return its file for the next run."""
-    file = CheckpointFile(folder, Settings(), pack.model)
-    file.save(pack.estimator.record, cells=pack.cells.saved_state)
-    return CheckpointFile(folder, Settings(), pack.model)
+def saved_checkpoint(folder: Path, pack: SimulatedPack) -> StateFiles:
+    """Save a checkpoint of a pack; return its files for the next run."""
+    StateFiles(folder, Settings(), pack.model).checkpoint.save(pack.estimator.record, cells=pack.cells.saved_state)
+    return StateFiles(folder, Settings(), pack.model)
 
 
-def restarted(file: CheckpointFile, pack: SimulatedPack) -> CellEstimator:
+def restarted(files: StateFiles, pack: SimulatedPack) -> CellEstimator:
     """Return the estimators of the cells of the next run."""
     estimator = Estimator(pack.model)
     cells = CellEstimator(estimator)
-    restore_pack(Pack(estimator, cells=cells), file, None)
+    files.restore(Pack(estimator, cells=cells))
     return cells
 
 
@@ -42,17 +40,17 @@ def test_an_invalid_state_of_the_cells_is_dropped_with_a_reason_and_the_pack_is_
     pack = SimulatedPack()
     pack.run(1)
     pack.cells.cells["covariance"][2] = np.nan
-    file = saved_checkpoint(tmp_path, pack)
+    files = saved_checkpoint(tmp_path, pack)
     with structlog.testing.capture_logs() as lines:
-        cells = restarted(file, pack)
+        cells = restarted(files, pack)
     assert cells.deviations is None
-    assert [line["reason"] for line in lines if "single cells" in line["event"]] == ["a value is not finite"]
+    assert [line["outcome"] for line in lines if line["event"] == "cells"] == ["refused: a value is not finite"]
     assert any(line.get("outcome", "").startswith("restored") for line in lines)
 
 
 def test_a_checkpoint_without_cell_voltages_starts_the_cells_anew(tmp_path: Path) -> None:
     pack = SimulatedPack()
     pack.run(1)
-    file = CheckpointFile(tmp_path, Settings(), pack.model)
-    file.save(pack.estimator.record)
-    assert restarted(CheckpointFile(tmp_path, Settings(), pack.model), pack).deviations is None
+    files = StateFiles(tmp_path, Settings(), pack.model)
+    files.checkpoint.save(pack.estimator.record)
+    assert restarted(StateFiles(tmp_path, Settings(), pack.model), pack).deviations is None

@@ -9,9 +9,9 @@ import pytest
 
 from bms_estimator.checkpoint.changes_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_BASE_AGE_S, MAX_SOC_CHANGE
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.identity import fields
-from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.restore import restore_state
+from bms_estimator.model.arrays import fields
 from bms_estimator.process.boot_clock import BootTimestamp
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, learned_estimator
 
@@ -66,13 +66,13 @@ def test_small_changes_are_saved_in_one_block_and_restored_with_their_time(pack:
     assert sizes == [BLOCK_BYTES, BLOCK_BYTES]
     pack.now_s += 7.0
     content = pack.load()
-    assert content.unseen_s == pytest.approx(7.0)
+    assert content.gap_s == pytest.approx(7.0)
     count = state["filter"]["count"][0]
-    assert content.state["observer.soc"] == state["observer"]["soc"]
-    assert np.array_equal(content.state["filter.mean"][0, :count], state["filter"]["mean"][0, :count])
-    assert np.array_equal(content.state["history.charge_as"], state["history"]["charge_as"])
-    assert np.array_equal(content.state["filter.covariance"], first_covariance)
-    assert restore_state(new_estimator(SETTINGS, CELL), content.state, content.unseen_s) == ""
+    assert content.record["observer.soc"] == state["observer"]["soc"]
+    assert np.array_equal(content.record["filter.mean"][0, :count], state["filter"]["mean"][0, :count])
+    assert np.array_equal(content.record["history.charge_as"], state["history"]["charge_as"])
+    assert np.array_equal(content.record["filter.covariance"], first_covariance)
+    assert restore_state(new_estimator(SETTINGS, CELL), content.record, content.gap_s) == ""
 
 
 def test_a_block_damaged_by_a_power_failure_leaves_the_state_of_the_save_before(pack: SavedPack) -> None:
@@ -80,14 +80,14 @@ def test_a_block_damaged_by_a_power_failure_leaves_the_state_of_the_save_before(
     pack.run(5)
     newest = max((pack.file.path.with_suffix(s) for s in CHANGES_SUFFIXES), key=lambda path: path.stat().st_mtime_ns)
     newest.write_bytes(newest.read_bytes()[: BLOCK_BYTES // 2])
-    assert pack.load().state["observer.soc"] == before["observer"]["soc"]
+    assert pack.load().record["observer.soc"] == before["observer"]["soc"]
 
 
 def test_changes_of_an_earlier_whole_file_are_ignored(pack: SavedPack) -> None:
     pack.run(5)
     state = learned_estimator().record
     CheckpointFile(pack.file.path.parent, SETTINGS, CELL, pack.clock).save(state)
-    loaded = pack.load().state
+    loaded = pack.load().record
     assert all(np.array_equal(loaded[name], value, equal_nan=True) for name, value in fields(state))
 
 

@@ -17,12 +17,14 @@ import pytest
 from numpy.lib.recfunctions import repack_fields
 
 from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_FILES, CheckpointFile
-from bms_estimator.checkpoint.identity import fields, pack_identity
-from bms_estimator.checkpoint.restore import restore_state
+from bms_estimator.checkpoint.identity import pack_identity
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.kernels.kalman_filter.records import OFFSET
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.service import checkpoint_writer, live_loop
@@ -67,10 +69,8 @@ async def run_samples(
     source, sink = ScriptedSource(), Collector()
     source.give(*((float(i), current_a, 3.8 * cell.cell.series_count) for i in range(samples)))
     source.finish()
-    checkpoint = CheckpointFile(folder, settings, cell)
-    running = run_estimation_loop(
-        settings, cell, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint
-    )
+    files = StateFiles(folder, settings, cell)
+    running = run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=asyncio.Event(), files=files)
     estimator = await asyncio.wait_for(running, LONG_S)
     return RunResult(estimator, sink.snapshots[0].health)
 
@@ -107,10 +107,8 @@ async def test_the_gap_of_a_restart_lasts_until_the_first_valid_sample(
         source.give((0.1 * i, 0.0, 9.9))  # an implausible voltage
     source.give((5.0, 0.275, 3.8))
     source.finish()
-    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
-    running = run_estimation_loop(
-        SETTINGS, CELL, source=source, sinks=[Collector()], stop=asyncio.Event(), checkpoint=checkpoint
-    )
+    files = StateFiles(tmp_path, SETTINGS, CELL)
+    running = run_estimation_loop(SETTINGS, CELL, source=source, sinks=[Collector()], stop=asyncio.Event(), files=files)
     estimator = await asyncio.wait_for(running, LONG_S)
     assert 41.0 < estimator.record["unseen_s"][0] < 41.0 + LONG_S
 
@@ -318,13 +316,20 @@ def test_an_identifier_that_was_disabled_starts_at_the_counted_soc() -> None:
     assert 0.01 < identifying.record["filter"]["soc_std"][0] < 0.35
 
 
+def with_checkpoint(file: CheckpointFile) -> StateFiles:
+    """Return the files of the state beside a checkpoint file."""
+    files = StateFiles(file.path.parent, SETTINGS, CELL)
+    files.checkpoint = file
+    return files
+
+
 @asynccontextmanager
-async def run_with_frequent_saves(checkpoint: CheckpointFile) -> AsyncIterator[tuple[ScriptedSource, Collector, Any]]:
+async def run_with_frequent_saves(files: StateFiles) -> AsyncIterator[tuple[ScriptedSource, Collector, Any]]:
     """Run the service with a save every 20 ms; yield its source, its sink and its task."""
     settings = SETTINGS.model_copy(update={"state": SETTINGS.state.model_copy(update={"checkpoint_s": 0.02})})
     source, sink = ScriptedSource(), Collector()
     task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), files=files)
     )
     yield source, sink, task
     source.finish()
@@ -344,7 +349,7 @@ async def test_the_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
             saving.release()
 
     file = SlowDisk(tmp_path, SETTINGS, CELL)
-    async with run_with_frequent_saves(file) as (source, sink, task):
+    async with run_with_frequent_saves(with_checkpoint(file)) as (source, sink, task):
         source.give((0.0, 0.1, 3.8))
         assert await asyncio.to_thread(began.wait, LONG_S)
         source.give((1.0, 0.1, 3.8))
@@ -355,7 +360,7 @@ async def test_the_final_save_waits_for_a_running_save(tmp_path: Path) -> None:
         release.set()
         last = await asyncio.wait_for(task, LONG_S)
     assert saved_samples == [1, 2]
-    state = file.load().state
+    state = file.load().record
     for name, field in fields(last.record):
         assert state[name].tobytes() == field.tobytes()
 
@@ -390,7 +395,7 @@ async def test_changes_of_the_soc_are_saved_before_a_long_checkpoint_interval_ha
             source=source,
             sinks=[Collector()],
             stop=asyncio.Event(),
-            checkpoint=ReportingFile(tmp_path, settings, CELL),
+            files=with_checkpoint(ReportingFile(tmp_path, settings, CELL)),
         )
     )
     # Otherwise, the first sample may arrive before the first call of _save.
@@ -405,7 +410,7 @@ async def test_changes_of_the_soc_are_saved_before_a_long_checkpoint_interval_ha
 
 async def test_a_failed_save_is_reported_and_does_not_end_the_loop(tmp_path: Path) -> None:
     (tmp_path / "state").write_text("a file instead of the folder")
-    file = CheckpointFile(tmp_path / "state", SETTINGS, CELL)
+    file = StateFiles(tmp_path / "state", SETTINGS, CELL)
     async with run_with_frequent_saves(file) as (source, sink, _):
         source.give((0.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved: "))
@@ -428,9 +433,9 @@ async def test_a_save_on_a_full_disk_is_not_retried_at_each_change_of_the_soc(
         SETTINGS.model_dump(by_alias=True, exclude_none=True) | {"state": {"checkpoint_s": 1e6}}
     )
     source, sink = ScriptedSource(), Collector()
-    checkpoint = FullDiskFile(tmp_path, settings, CELL)
+    files = with_checkpoint(FullDiskFile(tmp_path, settings, CELL))
     task = asyncio.create_task(
-        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint)
+        run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), files=files)
     )
     for second in range(5):
         source.give((30.0 * second, 0.275, 3.8))
@@ -450,7 +455,7 @@ async def test_an_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch
             super().save(state, curves, cells, whole=whole)
             saved_samples.append(state["observer"]["samples"][0])
 
-    async with run_with_frequent_saves(CountingFile(tmp_path, SETTINGS, CELL)) as (source, sink, _):
+    async with run_with_frequent_saves(with_checkpoint(CountingFile(tmp_path, SETTINGS, CELL))) as (source, sink, _):
         for second in range(2):
             source.give((float(second), 0.1, 3.8))
             source.give((float(second), 0.1, 9.9))  # dropped, because its voltage is implausible
@@ -470,15 +475,15 @@ async def test_the_state_is_saved_when_an_error_ends_the_loop(tmp_path: Path) ->
                 yield block
             raise SensorError
 
-    source, file = FailingSource(), CheckpointFile(tmp_path, SETTINGS, CELL)
+    source, files = FailingSource(), StateFiles(tmp_path, SETTINGS, CELL)
     source.give((0.0, 0.1, 3.8))
     source.finish()
     with pytest.raises(SensorError):
-        await run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), checkpoint=file)
-    content = file.load()
-    assert content.reason == ""
-    assert content.state["observer.samples"] == 1
-    assert file.run_file.load().counters.total.crashes == 1
+        await run_estimation_loop(SETTINGS, CELL, source=source, sinks=[], stop=asyncio.Event(), files=files)
+    content = files.read()
+    assert not content.reasons
+    assert content.record["observer.samples"] == 1
+    assert files.run_file.load().counters.total.crashes == 1
 
 
 async def test_the_final_save_does_not_wait_for_a_slow_broker(tmp_path: Path) -> None:
@@ -487,13 +492,13 @@ async def test_the_final_save_does_not_wait_for_a_slow_broker(tmp_path: Path) ->
 
     class SlowBroker(Collector):
         async def __aexit__(self, *_: object) -> None:
-            is_saved_at_close.append(file.path.exists())
+            is_saved_at_close.append(files.checkpoint.path.exists())
 
     source, sink = ScriptedSource(), SlowBroker()
     source.give((0.0, 0.1, 3.8))
     source.finish()
-    file = CheckpointFile(tmp_path, SETTINGS, CELL)
-    running = run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=file)
+    files = StateFiles(tmp_path, SETTINGS, CELL)
+    running = run_estimation_loop(SETTINGS, CELL, source=source, sinks=[sink], stop=asyncio.Event(), files=files)
     await asyncio.wait_for(running, LONG_S)
     assert is_saved_at_close == [True]
     assert sink.snapshots[-1].health.checkpoint == "saved"

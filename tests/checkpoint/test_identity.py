@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.identity import fields, observer_identity, pack_identity
+from bms_estimator.checkpoint.identity import observer_identity, pack_identity
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.fleet.packs.pack_type import config_digest
 from bms_estimator.kernels.records import ESTIMATOR_STATE
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.fuel_cell import PackModel, load_any
 from bms_estimator.process.boot_clock import BootTimestamp
@@ -51,10 +52,10 @@ def test_a_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
     settings, cell = Settings.model_validate(WITH_IDENTIFIER), load_any("chen_mora")
     with np.load(CHECKPOINT_FILE) as file:
         minute_later = BootTimestamp(float(file["wall_s"]) + 60.0, True, 0.0, "another boot")
-    checkpoint = CheckpointFile(tmp_path, settings, cell, lambda: minute_later)
-    checkpoint.path.write_bytes(CHECKPOINT_FILE.read_bytes())
-    restored = checkpoint.load()
-    assert restored.reason == ""
-    saved = checkpoint.run_file.load()
+    files = StateFiles(tmp_path, settings, cell, lambda: minute_later)
+    files.checkpoint.path.write_bytes(CHECKPOINT_FILE.read_bytes())
+    restored = files.read()
+    assert not restored.reasons
+    saved = files.run_file.load()
     assert (saved.counters.restarts, saved.lost_reason, saved.is_damaged) == (4, "", False)
-    assert restored.state["observer.soc"][0] == 0.3709922542638329
+    assert restored.record["observer.soc"][0] == 0.3709922542638329

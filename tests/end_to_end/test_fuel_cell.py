@@ -9,9 +9,9 @@ import numpy as np
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.captures.replay import RawCapture
@@ -72,14 +72,14 @@ folder = "{tmp_path / "state"}"
 
     settings, cell = load_pack(pack)
     saved = CheckpointFile(tmp_path / "state", settings, cell).load()
-    assert saved.reason == ""
+    assert not saved.reasons
     replayed, resumed = new_estimator(settings, cell), new_estimator(settings, cell)
     for block in RawCapture(capture):
         replayed.run(block)
-    assert saved.state["learning.theta"].tobytes() == replayed.record["learning"]["theta"].tobytes(), "to the last bit"
-    assert restore_state(resumed, saved.state, unseen_s=10.0) == ""
+    assert saved.record["learning.theta"].tobytes() == replayed.record["learning"]["theta"].tobytes(), "to the last bit"
+    assert restore_state(resumed, saved.record, unseen_s=10.0) == ""
     np.testing.assert_array_equal(resumed.record["learning"]["theta"], replayed.record["learning"]["theta"])
-    not_finite = {**saved.state, "learning.theta": np.full_like(saved.state["learning.theta"], np.nan)}
+    not_finite = {**saved.record, "learning.theta": np.full_like(saved.record["learning.theta"], np.nan)}
     assert (
         restore_state(new_estimator(settings, cell), not_finite, unseen_s=10.0) == "theta of the learning is not finite"
     )

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.identity import fields
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
@@ -224,7 +224,7 @@ async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
             await listener.wait_json("bms/pack/health", lambda h: h["line"]["resets"] and h["samples"]["samples"] > 450)
         running.cancel()
     settings, cell = load_pack(pack)
-    live = CheckpointFile(tmp_path / "state", settings, cell).load().state
+    live = CheckpointFile(tmp_path / "state", settings, cell).load().record
     replayed = new_estimator(settings, cell)
     pack_replay, capture_file = Pack(replayed, SlowFit(replayed)), RawCapture(capture)
     for block in capture_file:

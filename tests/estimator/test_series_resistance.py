@@ -11,10 +11,11 @@ from bms_estimator.calibration.thesis.series_resistance import (
     series_resistance,
     series_resistance_from_sums,
 )
-from bms_estimator.checkpoint.identity import fields, without_observer
-from bms_estimator.checkpoint.restore import restore_state
+from bms_estimator.checkpoint.identity import without_observer
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.observer.series_resistance import BINS, MAX_SAMPLES
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.telemetry.parameters import make_parameters_payload

@@ -10,27 +10,23 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from bms_estimator.checkpoint.arrays_file import HISTORY_SUFFIX, LOAD_SUFFIX
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, SUFFIX, HistoryFile
-from bms_estimator.checkpoint.identity import fields
-from bms_estimator.checkpoint.load_file import restore_seen_load
-from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.cells.records import BANK as BANK_STATE
 from bms_estimator.kernels.cells.records import CELL as CELL_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.pack import pack
-from bms_estimator.pack.pack import make_forecaster
+from bms_estimator.pack.pack import new_pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning, solve
 from bms_estimator.pack_model.history import ReferenceDischarges, WeakCellTime
-from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
+from bms_estimator.pack_model.learning import Submit, run_now
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays, neutral_fit
-from bms_estimator.service.restored_pack import restore_pack
 from bms_estimator.settings.pack import Settings
 
 SERIES = 4
@@ -60,17 +56,17 @@ RECORDS = {
     (STATE_SUFFIX, "state"): ESTIMATOR_STATE,
     (STATE_SUFFIX, "cells.cells"): CELL_STATE,
     (STATE_SUFFIX, "cells.bank"): BANK_STATE,
-    (SUFFIX, "rows"): HISTORY_ROW,
-    (SUFFIX, "bank_rows"): HISTORY_ROW,
+    (HISTORY_SUFFIX, "rows"): HISTORY_ROW,
+    (HISTORY_SUFFIX, "bank_rows"): HISTORY_ROW,
 }
 """Types of the structured arrays."""
 FIT_FIELDS = tuple(curve_arrays(neutral_fit()))
-METADATA = ("observer", "token", "wall_s", "synchronised", "boot_s", "boot")
+METADATA = ("capacity_ah", "r_s_ohm", "observer", "token", "wall_s", "synchronised", "boot_s", "boot")
 PLACES: tuple[Place, ...] = (
     *((file, name, field) for (file, name), record in RECORDS.items() for field, _ in fields(np.zeros(1, record))),
     *((STATE_SUFFIX, name, "") for name in (*METADATA, *(f"fit.{name}" for name in FIT_FIELDS))),
-    *((SUFFIX, name, "") for name in (*FIT_FIELDS, *(f"bank_{name}" for name in FIT_FIELDS))),
-    *((SUFFIX, name, "") for name in ("weak_cell_times", "row_elapsed_s", "row_soc", "curves")),
+    *((HISTORY_SUFFIX, name, "") for name in (*FIT_FIELDS, *(f"bank_{name}" for name in FIT_FIELDS))),
+    *((HISTORY_SUFFIX, name, "") for name in ("weak_cell_times", "row_elapsed_s", "row_soc", "curves")),
     *((LOAD_SUFFIX, name, "") for name in ("mean_a", "max_a", "filtered_a", "last_a", "rest_s")),
     *((LOAD_SUFFIX, name, "") for name in ("minutes_mean_a", "minutes_max_a", "seen_discharge_a", "seen_charge_a")),
 )
@@ -92,23 +88,24 @@ class Pack:
     """Pack of the service with its files in a folder."""
 
     def __init__(self, folder: Path, submit: Submit = run_now) -> None:
-        self.checkpoint, self.history = CheckpointFile(folder, SETTINGS, CELL), HistoryFile(folder, SETTINGS, CELL)
-        self.load = HistoryFile(folder, SETTINGS, CELL, LOAD_SUFFIX)
-        self.estimator = new_estimator(SETTINGS, CELL)
-        self.cells = CellEstimator(self.estimator)
-        self.slow_fit = SlowFit(self.estimator, interval_s=FIT_S, submit=submit)
-        forecaster = make_forecaster(SETTINGS, CELL, self.estimator)
-        assert forecaster
-        self.forecaster = forecaster
-        self.pack = pack.Pack(self.estimator, self.slow_fit, self.cells, forecaster, has_forecasts=False)
-        restore_pack(self.pack, self.checkpoint, self.history)
-        restore_seen_load(self.load, forecaster)
+        self.files = StateFiles(folder, SETTINGS, CELL)
+        self.pack = pack = new_pack(SETTINGS, CELL, submit=submit, has_forecasts=False)
+        assert pack.slow_fit
+        assert pack.cells
+        assert pack.forecaster
+        self.estimator, self.slow_fit, self.cells, self.forecaster = (
+            pack.estimator,
+            pack.slow_fit,
+            pack.cells,
+            pack.forecaster,
+        )
+        self.files.restore(self.pack)
 
     def save(self) -> None:
         """Write all files."""
-        self.checkpoint.save(self.estimator.record, curve_arrays(self.slow_fit.fit), self.cells.saved_state)
-        self.history.save(history_arrays(self.slow_fit.history, self.slow_fit.saved_fit))
-        self.load.save(load_arrays(self.forecaster.load, self.forecaster.past))
+        self.files.checkpoint.save(self.estimator.record, curve_arrays(self.slow_fit.fit), self.cells.saved_state)
+        self.files.history.save(history_arrays(self.slow_fit.history, self.slow_fit.saved_fit))
+        self.files.load.save(load_arrays(self.forecaster.load, self.forecaster.past))
 
     def run(self, hours: float) -> None:
         """Process samples with cell voltages, without forecasts."""
@@ -136,13 +133,13 @@ def seed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     history.weak_cell_times = [WeakCellTime(100.0, 200.0, 0.5), WeakCellTime(1000.0, np.inf, 0.4)]
     pack.save()
     assert pack.slow_fit.fits
-    return pack.history.path.parent
+    return pack.files.history.path.parent
 
 
 @cache
 def load_files(folder: Path) -> Files:
     """Return the arrays of the files in a folder."""
-    return {suffix: dict(np.load(folder / f"{STEM}{suffix}")) for suffix in (STATE_SUFFIX, SUFFIX, LOAD_SUFFIX)}
+    return {suffix: dict(np.load(folder / f"{STEM}{suffix}")) for suffix in (STATE_SUFFIX, HISTORY_SUFFIX, LOAD_SUFFIX)}
 
 
 def test_all_arrays_of_the_files_are_changed(seed: Path) -> None:
@@ -182,8 +179,8 @@ def with_change(files: Files, place: Place, change: Change, index: int) -> Files
     return {**files, file: {**files[file], name: edited}}
 
 
-@example((SUFFIX, "rows", "segment"), 1e300, 0)
-@example((SUFFIX, "rows", "soc"), np.nan, 0)
+@example((HISTORY_SUFFIX, "rows", "segment"), 1e300, 0)
+@example((HISTORY_SUFFIX, "rows", "soc"), np.nan, 0)
 @given(st.sampled_from(PLACES), st.sampled_from(CHANGES), st.integers(0, 1 << 16))
 def test_a_pack_with_an_implausible_value_in_one_file_runs_on(
     tmp_path_factory: pytest.TempPathFactory, seed: Path, place: Place, change: Change, index: int
@@ -193,8 +190,8 @@ def test_a_pack_with_an_implausible_value_in_one_file_runs_on(
         np.savez(folder / f"{STEM}{suffix}", **arrays)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of numpy, which ends no service
-        pack = Pack(folder, run_now if place[0] == SUFFIX else lambda _: Future())  # other files need no fit
-        is_fitted = place[0] == SUFFIX and not list(folder.glob(f"*.refused{SUFFIX}"))
+        pack = Pack(folder, run_now if place[0] == HISTORY_SUFFIX else lambda _: Future())  # other files need no fit
+        is_fitted = place[0] == HISTORY_SUFFIX and not list(folder.glob(f"*.refused{HISTORY_SUFFIX}"))
         pack.run(0.6 if is_fitted else 0.03)
         if place[0] == LOAD_SUFFIX:
             pack.forecaster.forecast()

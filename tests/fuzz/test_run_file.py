@@ -8,15 +8,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.checksum import add_checksum
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.restored_pack import read_counters
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
 from tests.fuzz.edited_seeds import edit
@@ -70,9 +69,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def restore(folder: Path, content: bytes) -> set[str]:
     """Restore from a file as the service does, and encode what it publishes. Return the names of the raised alarms."""
-    checkpoint, clock = CheckpointFile(folder, SETTINGS, CELL), Clock()
-    checkpoint.run_file.path.write_bytes(content)
-    saved = read_counters(checkpoint, clock)
+    files, clock = StateFiles(folder, SETTINGS, CELL), Clock()
+    files.run_file.path.write_bytes(content)
+    saved = files.read_counters()
     assert len(CellSlots(3, saved.counters.cell_slots).select(np.full((2, 6), 3.7))) == 2
     monitor = AlarmMonitor(SETTINGS, Pack(ESTIMATOR), ScriptedSource(), clock, lambda _: None)
     if reason := saved.lost_reason or monitor.restore(saved.counters.alarms):

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack, new_pack
+from bms_estimator.pack.state import PackState
 from bms_estimator.pack_model import learning
+from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.settings.pack import Settings
 from tests.pack_model.quick_fit import quick_fit
 from tests.simulated_pack import CAPACITY_AH, SimulatedPack
@@ -63,3 +66,28 @@ def test_a_pack_without_forecasts_still_observes_the_load(recording: tuple[np.nd
     assert np.isnan(step.forecasts["time_to_cutoff_s"]).all()
     assert pack.forecaster.load.seconds > 0
     assert pack.forecaster.past.mean_a.size > 0
+
+
+def test_the_wait_for_the_first_sample_extends_the_gap_of_record_history_and_cells(
+    recording: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learning, "fit", quick_fit)
+    before, model = new_pack(Settings(), SimulatedPack().model), SimulatedPack().model
+    before.run(*recording)
+    assert before.slow_fit
+    assert before.cells
+    history = history_arrays(before.slow_fit.history, before.slow_fit.saved_fit)
+    curves = curve_arrays(before.slow_fit.fit)
+    state = PackState(dict(fields(before.estimator.record)), curves, before.cells.saved_state, history)
+    pack = new_pack(Settings(), model)
+    outcomes = pack.restore(state, 10.0)
+    assert set(outcomes) == {"checkpoint", "history"}
+    assert all(outcome.startswith("restored") for outcome in outcomes.values())
+    assert pack.cells
+    record, bank = pack.estimator.record, pack.cells.bank
+    pack.waited(2.0)
+    pack.waited(3.0)
+    assert record["unseen_s"][0] == record["history"]["gap_s"][0] == bank["unseen_s"][0] == 15.0
+    pack.run(recording[0][:1], recording[1][:1])
+    pack.waited(4.0)
+    assert record["history"]["gap_s"][0] == 15.0

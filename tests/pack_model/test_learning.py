@@ -9,6 +9,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.estimator.fitted_state import FILTER_STATES
 from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC, STATES
 from bms_estimator.model.cell import load_cell
@@ -18,7 +19,6 @@ from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import FitError, PackFit
-from bms_estimator.pack_model.handover import FILTER_STATES
 from bms_estimator.pack_model.learning import SlowFit, run_now
 from bms_estimator.settings.sampling import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured

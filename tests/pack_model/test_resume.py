@@ -33,7 +33,7 @@ def discharged(seconds: int, saved_s: int) -> tuple[Estimator, History]:
 def resumed(estimator: Estimator, saved: History, gap_s: float = 30.0) -> np.void:
     """Continue the saved history, and return the record of the history."""
     h: np.void = estimator.record[0]["history"]
-    resume_history(h, estimator.record[0]["filter"], saved, gap_s, CAPACITY_AS, restored=True)
+    resume_history(estimator, saved, gap_s, CAPACITY_AS, restored=True)
     return h
 
 

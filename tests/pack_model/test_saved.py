@@ -10,7 +10,6 @@ from bms_estimator.estimator.estimator import Estimator, new_estimator
 from bms_estimator.estimator.identified_parameters import identified_cell, relative_series_resistance
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
-from bms_estimator.pack_model.curve_change import return_to_cell_file
 from bms_estimator.pack_model.handover import adopt_curves
 from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.saved import curve_arrays, fit_of_curves, history_arrays, history_of
@@ -86,7 +85,7 @@ def test_r_s_is_relative_to_the_cell_file() -> None:
 def test_the_published_curve_contains_the_fit() -> None:
     estimator = fitted_estimator()
     curve = make_parameters_payload(estimator, 0.0).ocv
-    return_to_cell_file(estimator)
+    estimator.return_to_cell_file()
     file_curve = make_parameters_payload(estimator, 0.0).ocv
     assert curve
     assert file_curve
@@ -116,7 +115,7 @@ def test_return_to_the_cell_file_keeps_the_resistances() -> None:
     estimator = fitted_estimator()
     before = relative_series_resistance(estimator.record[0], estimator.settings_record[0], estimator.cell_file_settings)
     soc = float(estimator.record["filter"]["soc"][0])
-    return_to_cell_file(estimator)
+    estimator.return_to_cell_file()
     after = relative_series_resistance(estimator.record[0], estimator.settings_record[0], estimator.cell_file_settings)
     assert after.value == pytest.approx(before.value)
     assert estimator.record["filter"]["soc"][0] == soc

@@ -21,6 +21,7 @@ import pytest
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.checksum import add_checksum
 from bms_estimator.checkpoint.run_file import RunCounters
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.events import events
@@ -31,7 +32,7 @@ from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import checkpoint_writer, relay_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import lacks_alarm
-from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
@@ -113,8 +114,8 @@ async def run(
     tables = [AlarmHook.model_validate(table) for table in (*HOOKS, *added_hooks)]
     hooks = AlarmHooks(tables, "pack", acknowledge_in(messages), board)
     requests = RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",))
-    checkpoint, volts = CheckpointFile(folder, settings, cell), cell.cell.series_count
-    async with running(checkpoint, settings, cell, hooks=hooks, requests=requests) as (source, sink):
+    files, volts = StateFiles(folder, settings, cell), cell.cell.series_count
+    async with running(files, settings, cell, hooks=hooks, requests=requests) as (source, sink):
         source.give_block(np.array([(t, a, v * volts, c, c, c, s) for t, a, v, c, s in rows], SAMPLE), slots_v)
         await sink.until(lambda s: s.estimate is not None and until(by_name(s.alarms)))
         if acknowledge:
@@ -133,12 +134,22 @@ async def run(
 
 @asynccontextmanager
 async def running(
-    checkpoint: CheckpointFile, settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any
+    files: StateFiles, settings: Settings = SETTINGS, cell: CellModel = CELL, clock: Clock | None = None, **parts: Any
 ) -> AsyncIterator[tuple[ScriptedSource, Collector]]:
-    """Run the service. At the end its source ends. ``options`` are arguments of ``run_estimation_loop``."""
+    """Run the service. At the end its source ends. ``parts`` are fields of ``ServiceParts``."""
     source, sink, stop = ScriptedSource(), Collector(), asyncio.Event()
-    loop = run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, checkpoint=checkpoint, **options)
-    task = asyncio.create_task(loop)
+    task = asyncio.create_task(
+        run_estimation_loop(
+            settings,
+            cell,
+            source=source,
+            sinks=[sink],
+            stop=stop,
+            files=files,
+            parts=ServiceParts(**parts),
+            clock=clock,
+        )
+    )
     yield source, sink
     source.finish()
     await asyncio.wait_for(task, LONG_S)
@@ -270,7 +281,7 @@ async def test_lost_alarms_keep_the_relay_at_its_level_until_they_are_acknowledg
 def test_damaged_alarms_are_recognized(latched: Path, tmp_path: Path, damage: str) -> None:
     shutil.copy(latched / "pack.run", tmp_path)
     shutil.copy(CheckpointFile(latched, SETTINGS, CELL).path, tmp_path)
-    file, edit = CheckpointFile(tmp_path, SETTINGS, CELL).run_file, DAMAGES[damage]
+    file, edit = StateFiles(tmp_path, SETTINGS, CELL).run_file, DAMAGES[damage]
     if edit is None:
         file.path.unlink()
     else:
@@ -289,7 +300,7 @@ def restore_fails(alarms: str) -> bool:
 
 
 def test_a_crashed_run_is_recognized(folder: Path) -> None:
-    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    file = StateFiles(folder, SETTINGS, CELL).run_file
     assert not file.load().crashed
     file.save(file.load().counters)
     assert file.load().crashed
@@ -380,7 +391,7 @@ def remove_run_file(folder: Path) -> None:
 
 
 def copy_from_another_pack(folder: Path) -> None:
-    another = CheckpointFile(folder, edit_settings("pack", name="another"), CELL).run_file
+    another = StateFiles(folder, edit_settings("pack", name="another"), CELL).run_file
     another.save(another.load().counters)
     another.path.replace(folder / "pack.run")
 
@@ -441,7 +452,7 @@ async def test_lost_cells_stay_lost_after_damaged_alarms(tmp_path: Path) -> None
 
 
 async def test_fewer_cells_in_series_than_measured_before_drop_no_alarm(tmp_path: Path) -> None:
-    file = CheckpointFile(tmp_path, SETTINGS, CELL).run_file
+    file = StateFiles(tmp_path, SETTINGS, CELL).run_file
     saved = file.load().counters
     state = json.dumps(RAISED | {"inputs": {"cells": [16, False]}})
     file.save(type(saved)(saved.restarts, saved.total, clean=True, alarms=state))
@@ -454,33 +465,33 @@ async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 1e6)
     settings = edit_settings("state", checkpoint_s=1e6)
-    checkpoint = CheckpointFile(tmp_path, settings, CELL)
-    async with running(checkpoint, settings) as (source, _):
-        await wait_until(checkpoint.run_file.path.exists)
+    files = StateFiles(tmp_path, settings, CELL)
+    async with running(files, settings) as (source, _):
+        await wait_until(files.run_file.path.exists)
         source.give(*OVER_VOLTAGE)
-        await wait_until(lambda: "pack_over_voltage" in checkpoint.run_file.load().counters.alarms)
+        await wait_until(lambda: "pack_over_voltage" in files.run_file.load().counters.alarms)
 
 
 async def test_the_final_save_has_an_alarm_of_samples_that_arrived_since_the_last_evaluation(tmp_path: Path) -> None:
     """The clock stands, so that the next evaluation is not due."""
-    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
+    files = StateFiles(tmp_path, SETTINGS, CELL)
     clock = Clock(monotonic=lambda: 0.0)
-    async with running(checkpoint, clock=clock) as (source, sink):
+    async with running(files, clock=clock) as (source, sink):
         source.give(*NORMAL)
         await sink.until(lambda s: s.estimate is not None)
         source.give(*((12.0 + t, 0.0, 4.4, 25.0, 0) for t in range(5)))
     assert by_name(sink.snapshots[-1].alarms)["pack_over_voltage"].active
-    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+    assert "pack_over_voltage" in files.run_file.load().counters.alarms
 
 
 async def test_an_acknowledgement_during_the_final_save_is_rejected(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The answer, the hooks and the saved alarms agree."""
-    checkpoint = CheckpointFile(folder, SETTINGS, CELL)
+    files = StateFiles(folder, SETTINGS, CELL)
     requests, save, is_saving, may_save = (
         RequestDispatcher(DeliveryStats(), ("acknowledge_alarm",)),
-        checkpoint.run_file.save,
+        files.run_file.save,
         threading.Event(),
         threading.Event(),
     )
@@ -491,8 +502,8 @@ async def test_an_acknowledgement_during_the_final_save_is_rejected(
             may_save.wait(LONG_S)
         save(counters)
 
-    monkeypatch.setattr(checkpoint.run_file, "save", save_slowly)
-    async with running(checkpoint, requests=requests) as (source, sink):
+    monkeypatch.setattr(files.run_file, "save", save_slowly)
+    async with running(files, requests=requests) as (source, sink):
         source.give(*NORMAL)
         source.finish()
         await asyncio.to_thread(is_saving.wait, LONG_S)
@@ -501,7 +512,7 @@ async def test_an_acknowledgement_during_the_final_save_is_rejected(
         may_save.set()
     assert response["error"] == "the service is stopping"
     assert is_latched(by_name(sink.snapshots[-1].alarms))
-    assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+    assert "pack_over_voltage" in files.run_file.load().counters.alarms
 
 
 async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
@@ -509,12 +520,12 @@ async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     settings = edit_settings("state", checkpoint_s=1e6)
-    checkpoint = CheckpointFile(folder, settings, CELL)
-    async with running(checkpoint, settings):
-        await wait_until(lambda: not json.loads(checkpoint.run_file.path.read_bytes().partition(b"\n")[2])["clean"])
+    files = StateFiles(folder, settings, CELL)
+    async with running(files, settings):
+        await wait_until(lambda: not json.loads(files.run_file.path.read_bytes().partition(b"\n")[2])["clean"])
         shutil.rmtree(folder)
-        await wait_until(checkpoint.run_file.path.exists)
-        assert "pack_over_voltage" in checkpoint.run_file.load().counters.alarms
+        await wait_until(files.run_file.path.exists)
+        assert "pack_over_voltage" in files.run_file.load().counters.alarms
 
 
 async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full(
@@ -526,13 +537,13 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
     settings = edit_settings("state", checkpoint_s=1e6)
     blocked = tmp_path / "state"
     blocked.write_text("a file instead of the folder")
-    checkpoint = CheckpointFile(blocked, settings, CELL)
-    async with running(checkpoint, settings) as (source, sink):
+    files = StateFiles(blocked, settings, CELL)
+    async with running(files, settings) as (source, sink):
         source.give(*OVER_VOLTAGE)
         await sink.until(lambda s: is_latched(by_name(s.alarms)))
         await sink.until(lambda s: s.health.checkpoint.startswith("cannot be saved"))
         blocked.unlink()
-        await wait_until(lambda: "pack_over_voltage" in checkpoint.run_file.load().counters.alarms)
+        await wait_until(lambda: "pack_over_voltage" in files.run_file.load().counters.alarms)
 
 
 async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
@@ -541,9 +552,9 @@ async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
     folder = tmp_path / "state"
-    checkpoint = CheckpointFile(folder, SETTINGS, CELL)
-    async with running(checkpoint) as (source, sink):
-        await wait_until(checkpoint.run_file.path.exists)
+    files = StateFiles(folder, SETTINGS, CELL)
+    async with running(files) as (source, sink):
+        await wait_until(files.run_file.path.exists)
         folder.rename(tmp_path / "former")
         folder.write_text("a file instead of the folder")
         source.give(*OVER_VOLTAGE)
@@ -557,11 +568,11 @@ async def test_a_disk_that_hangs_between_two_saves_is_reported(tmp_path: Path, m
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "DISK_HUNG_S", 0.01)
     settings, may_continue = edit_settings("state", checkpoint_s=1e6), threading.Event()
-    checkpoint = CheckpointFile(tmp_path, settings, CELL)
-    async with running(checkpoint, settings) as (source, sink):
+    files = StateFiles(tmp_path, settings, CELL)
+    async with running(files, settings) as (source, sink):
         source.give(*NORMAL)
         await sink.until(lambda s: s.health.checkpoint == "saved")
-        checkpoint.thread.submit(may_continue.wait)
+        files.thread.submit(may_continue.wait)
         await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs", skip=len(sink.snapshots))
         may_continue.set()
 
@@ -571,19 +582,19 @@ async def test_an_alarm_that_is_saved_at_the_second_attempt_is_not_lost(
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
     monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
-    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
-    save, failures = checkpoint.run_file.save, [OSError(errno.EROFS, "read-only")]
+    files = StateFiles(tmp_path, SETTINGS, CELL)
+    save, failures = files.run_file.save, [OSError(errno.EROFS, "read-only")]
 
     def save_after_a_failure(counters: RunCounters) -> None:
         if "pack_over_voltage" in counters.alarms and failures:
             raise failures.pop()
         save(counters)
 
-    monkeypatch.setattr(checkpoint.run_file, "save", save_after_a_failure)
-    async with running(checkpoint) as (source, sink):
-        await wait_until(checkpoint.run_file.path.exists)
+    monkeypatch.setattr(files.run_file, "save", save_after_a_failure)
+    async with running(files) as (source, sink):
+        await wait_until(files.run_file.path.exists)
         source.give(*OVER_VOLTAGE)
-        await wait_until(lambda: "pack_over_voltage" in checkpoint.run_file.load().counters.alarms)
+        await wait_until(lambda: "pack_over_voltage" in files.run_file.load().counters.alarms)
     assert not failures
     assert not by_name(sink.snapshots[-1].alarms)["alarm_state_lost"].active
 
@@ -595,8 +606,8 @@ async def test_after_a_suspend_the_relay_stays_open_until_new_samples_are_watche
     monkeypatch.setattr(relay_hook, "RELAY_S", relay_hook.RESET_POLL_S)
     now_s, board = 0.0, RecordingBoard()
     hooks, clock = AlarmHooks([AlarmHook.model_validate(HOOKS[0])], "pack", None, board), Clock(monotonic=lambda: now_s)
-    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
-    async with running(checkpoint, clock=clock, hooks=hooks) as (source, sink):
+    files = StateFiles(tmp_path, SETTINGS, CELL)
+    async with running(files, clock=clock, hooks=hooks) as (source, sink):
         source.give(*NORMAL)
         await wait_until(lambda: board.levels)
         assert all(board.levels)
@@ -613,10 +624,10 @@ async def test_after_a_suspend_the_relay_stays_open_until_new_samples_are_watche
 
 
 async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_is_gone(tmp_path: Path) -> None:
-    checkpoint = CheckpointFile(tmp_path, SETTINGS, CELL)
-    async with running(checkpoint) as (source, _):
+    files = StateFiles(tmp_path, SETTINGS, CELL)
+    async with running(files) as (source, _):
         source.give(*OVER_VOLTAGE[:1])
-        await wait_until(lambda: "pending" in checkpoint.run_file.load().counters.alarms)
+        await wait_until(lambda: "pending" in files.run_file.load().counters.alarms)
         killed = Path(shutil.copytree(tmp_path, tmp_path / "killed"))
     restarted = await run(killed, NORMAL)
     assert restarted.alarms["pack_over_voltage"].active
@@ -626,7 +637,7 @@ async def test_a_kill_within_the_delay_of_an_alarm_raises_it_although_its_cause_
 def test_an_alarm_is_saved_in_a_folder_that_cannot_be_written(folder: Path) -> None:
     if os.geteuid() != 0 or subprocess.run(["chattr", "+i", folder], check=False).returncode != 0:
         pytest.skip("no folder can be made immutable here")
-    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    file = StateFiles(folder, SETTINGS, CELL).run_file
     try:
         file.save(dataclasses.replace(file.load().counters, alarms=json.dumps(RAISED | {"silence": "no samples"})))
     finally:
@@ -636,10 +647,10 @@ def test_an_alarm_is_saved_in_a_folder_that_cannot_be_written(folder: Path) -> N
 
 def test_an_alarm_is_saved_on_a_full_disk(folder: Path, full_disk: Path) -> None:
     path = (full_disk / "file").rename(full_disk / "pack.run")  # the only block of this disk
-    file = CheckpointFile(folder, SETTINGS, CELL).run_file
+    file = StateFiles(folder, SETTINGS, CELL).run_file
     counters = file.load().counters
     shutil.copy(file.path, path)
-    full = CheckpointFile(full_disk, SETTINGS, CELL).run_file
+    full = StateFiles(full_disk, SETTINGS, CELL).run_file
     full.save(dataclasses.replace(counters, alarms=json.dumps(RAISED)))
     assert full.load().counters.alarms == json.dumps(RAISED)
     assert not full.load().lost_reason

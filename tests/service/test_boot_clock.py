@@ -37,7 +37,7 @@ def test_the_age_of_a_checkpoint_is_read_from_a_clock_that_can_be_trusted_and_is
     estimator.step(0.0, 0.1, 3.8)
     CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record)
     later = replace(SAVED, **changes)
-    assert CheckpointFile(tmp_path, SETTINGS, CELL, lambda: later).load().unseen_s == unseen_s
+    assert CheckpointFile(tmp_path, SETTINGS, CELL, lambda: later).load().gap_s == unseen_s
 
 
 def test_after_a_reboot_the_age_is_infinite_if_the_wall_clock_was_not_synchronized_before() -> None:

@@ -14,6 +14,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_LATER_FILES, CheckpointFile
 from bms_estimator.checkpoint.run_file import RunCounters, RunFile
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.payloads.totals import Totals
 from bms_estimator.process.boot_clock import BootTimestamp
@@ -30,6 +31,7 @@ from tests.checkpoint.test_checkpoint import (
     run_samples,
     run_with_frequent_saves,
     save_as,
+    with_checkpoint,
 )
 from tests.collector import Collector
 from tests.patience import LONG_S
@@ -49,10 +51,8 @@ async def run_at(hours: float, folder: Path, *rows: tuple[float, float, float], 
     source, sink = ScriptedSource(), Collector()
     source.give(*rows)
     source.finish()
-    checkpoint = CheckpointFile(folder, settings, CELL, lambda: clock_at(hours))
-    running = run_estimation_loop(
-        settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), checkpoint=checkpoint
-    )
+    files = StateFiles(folder, settings, CELL, lambda: clock_at(hours))
+    running = run_estimation_loop(settings, CELL, source=source, sinks=[sink], stop=asyncio.Event(), files=files)
     return await asyncio.wait_for(running, LONG_S), sink.snapshots[-1]
 
 
@@ -76,7 +76,7 @@ async def test_charge_and_energy_survive_restarts(tmp_path: Path) -> None:
     hour = [(float(s), 2.0, 3.8) for s in range(3601)]  # 2 Ah and 7.6 Wh
     _, discharged = await run_at(0.0, tmp_path, *hour)
     _, charged = await run_at(2.0, tmp_path, *((s, -1.0, v) for s, _, v in hour))
-    async with run_with_frequent_saves(CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(4.0))) as (
+    async with run_with_frequent_saves(StateFiles(tmp_path, SETTINGS, CELL, lambda: clock_at(4.0))) as (
         source,
         sink,
         _,
@@ -102,7 +102,7 @@ async def test_charge_and_energy_are_published_only_once_saved_so_that_a_kill_do
             assert not counters.total.samples or release.wait(LONG_S)
             super().save(counters)
 
-    file = CheckpointFile(tmp_path, SETTINGS, CELL)
+    file = StateFiles(tmp_path, SETTINGS, CELL)
     file.run_file = SlowDisk(tmp_path, "pack", lambda: clock_at(0.0).wall_s)
     async with run_with_frequent_saves(file) as (source, sink, _):
         source.give(*((float(s), 2.0, 3.8) for s in range(1801)))
@@ -118,9 +118,9 @@ async def test_charge_and_energy_are_published_only_once_saved_so_that_a_kill_do
 async def test_a_run_without_usable_samples_does_not_change_the_age_of_the_saved_state(tmp_path: Path) -> None:
     await run_at(0.0, tmp_path, (0.0, 0.1, 3.8))
     await run_at(1.0, tmp_path, (0.0, 0.1, 9.9))  # out of range
-    file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(2.0))
+    file = StateFiles(tmp_path, SETTINGS, CELL, lambda: clock_at(2.0))
     counters = file.run_file.load().counters
-    assert file.load().unseen_s == pytest.approx(7200.0)
+    assert file.checkpoint.load().gap_s == pytest.approx(7200.0)
     assert counters.restarts == 2
     assert counters.total.samples["dropped_range"] == 1
 
@@ -135,7 +135,7 @@ async def run_and_kill(folder: Path, *, with_a_sample: bool) -> None:
                 written.set()
 
     written = threading.Event()
-    file = CheckpointFile(folder, SETTINGS, CELL)
+    file = StateFiles(folder, SETTINGS, CELL)
     file.run_file = Killed(folder, "pack", lambda: clock_at(0.0).wall_s)
     async with run_with_frequent_saves(file) as (source, _, _):
         if with_a_sample:
@@ -161,7 +161,12 @@ async def test_a_checkpoint_older_than_the_configured_age_is_rejected(tmp_path: 
         (47.0, edit_settings("state", longest_days=2.0), ""),
         (49.0, edit_settings("state", longest_days=2.0), "refused: it is 2.0 days old, state.longest_days is 2"),
     ):
-        assert CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: clock_at(hours)).load().reason == reason
+        assert (
+            CheckpointFile(tmp_path, settings, CELL, lambda hours=hours: clock_at(hours))
+            .load()
+            .reasons.get("checkpoint", "")
+            == reason
+        )
 
 
 COUNTERS = RunCounters(
@@ -172,8 +177,8 @@ COUNTERS = RunCounters(
 
 
 async def test_counters_continue_from_a_checkpoint_that_is_too_old(tmp_path: Path) -> None:
-    file = CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0))
-    file.save(learned_estimator().record)
+    file = StateFiles(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0))
+    file.checkpoint.save(learned_estimator().record)
     file.run_file.save(COUNTERS)
     _, last = await run_at(72.0, tmp_path, (0.0, 0.1, 3.8), settings=edit_settings("state", longest_days=2.0))
     assert (last.health.restarts, last.health.total.crashes, last.health.total.samples["samples"]) == (7, 2, 71)
@@ -183,13 +188,13 @@ async def test_checkpoints_of_later_versions_are_preserved_and_their_counters_co
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The later version runs once more than files are preserved. The oldest files remain, and the last one is replaced."""
-    file, inodes = CheckpointFile(tmp_path, SETTINGS, CELL), []
+    file, inodes = StateFiles(tmp_path, SETTINGS, CELL), []
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
     for attempt in range(MAX_LATER_FILES + 1):
         counters = dataclasses.replace(COUNTERS, restarts=6 + attempt)
-        save_as(FORMAT + 1, file, learned_estimator(), monkeypatch)
+        save_as(FORMAT + 1, file.checkpoint, learned_estimator(), monkeypatch)
         file.run_file.save(counters)
-        inodes.append(file.path.stat().st_ino)
+        inodes.append(file.checkpoint.path.stat().st_ino)
         health = (await run_samples(tmp_path, samples=1)).health
         files = min(attempt + 1, MAX_LATER_FILES)
         assert f"reads {FORMAT}; set aside as pack.later-{files}.npz; once the version" in health.checkpoint
@@ -232,8 +237,8 @@ async def test_implausible_counters_are_reset_and_the_state_is_restored(
 ) -> None:
     learned = learned_estimator()
     total = COUNTERS.total.model_copy(update=implausible)
-    file = CheckpointFile(tmp_path, SETTINGS, CELL)
-    file.save(learned.record)
+    file = StateFiles(tmp_path, SETTINGS, CELL)
+    file.checkpoint.save(learned.record)
     file.run_file.save(dataclasses.replace(COUNTERS, total=total))
     with capture_logs() as lines:
         health = (await run_samples(tmp_path, samples=1)).health
@@ -246,7 +251,7 @@ async def test_implausible_counters_are_reset_and_the_state_is_restored(
 
 async def test_a_deleted_state_folder_is_recreated_with_access_for_the_owner_only(tmp_path: Path) -> None:
     folder = tmp_path / "state"
-    async with run_with_frequent_saves(CheckpointFile(folder, SETTINGS, CELL)) as (source, sink, _):
+    async with run_with_frequent_saves(StateFiles(folder, SETTINGS, CELL)) as (source, sink, _):
         for second in range(3):
             snapshots_before = len(sink.snapshots)
             source.give((float(second), 0.1, 3.8))
@@ -258,7 +263,7 @@ async def test_a_deleted_state_folder_is_recreated_with_access_for_the_owner_onl
                 await asyncio.sleep(0.01)
             assert folder.stat().st_mode & 0o777 == 0o700
             shutil.rmtree(folder, ignore_errors=True)
-    assert [path.stat().st_mode & 0o777 for path in folder.iterdir()] == [0o600]
+    assert {path.stat().st_mode & 0o777 for path in folder.iterdir()} == {0o600}
 
 
 async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
@@ -273,14 +278,14 @@ async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
             release.wait()
 
     with capture_logs() as lines:
-        await run_with_hanging_disk(HungFile(tmp_path, SETTINGS, CELL))
+        await run_with_hanging_disk(with_checkpoint(HungFile(tmp_path, SETTINGS, CELL)))
     assert "the disk hangs: the last checkpoint is not written" in {line["event"] for line in lines}
     release.set()
 
 
-async def run_with_hanging_disk(hung_file: CheckpointFile) -> None:
+async def run_with_hanging_disk(hung_files: StateFiles) -> None:
     """Check that a service with a checkpoint on a hanging disk publishes samples and ends."""
-    async with run_with_frequent_saves(hung_file) as (source, sink, task):
+    async with run_with_frequent_saves(hung_files) as (source, sink, task):
         source.give((0.0, 0.1, 3.8))
         await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs")
         source.give((1.0, 0.1, 3.8))

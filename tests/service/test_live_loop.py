@@ -24,7 +24,7 @@ from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.process.systemd import SystemdNotifier
-from bms_estimator.service.live_loop import LAG_STEP_S, run_estimation_loop
+from bms_estimator.service.live_loop import LAG_STEP_S, ServiceParts, run_estimation_loop
 from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
@@ -67,13 +67,22 @@ class Run:
 
 
 @asynccontextmanager
-async def run_loop(settings: Settings = SETTINGS, cell: CellModel = CELL, **options: Any) -> AsyncIterator[Run]:
-    """Run the loop, and stop it at the end. ``options`` are arguments of ``run_estimation_loop``."""
+async def run_loop(
+    settings: Settings = SETTINGS, cell: CellModel = CELL, clock: Clock | None = None, **parts: Any
+) -> AsyncIterator[Run]:
+    """Run the loop with further ``ServiceParts``, and stop it at the end."""
     source, sink, stop, delivery = ScriptedSource(), Collector(), asyncio.Event(), DeliveryStats()
     requests = RequestDispatcher(delivery, ("set_soc", "current_zero", "publish_rate"))
-    arguments = {"requests": requests, "status": ServiceStatus(delivery)}
     task = asyncio.create_task(
-        run_estimation_loop(settings, cell, source=source, sinks=[sink], stop=stop, **arguments, **options)
+        run_estimation_loop(
+            settings,
+            cell,
+            source=source,
+            sinks=[sink],
+            stop=stop,
+            parts=ServiceParts(ServiceStatus(delivery), requests, **parts),
+            clock=clock,
+        )
     )
     try:
         yield Run(source, sink, requests, task, stop, delivery)

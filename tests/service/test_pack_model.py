@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bms_estimator.checkpoint.arrays_file import FORMAT, ArraysFile
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import FORMAT, HistoryFile
-from bms_estimator.checkpoint.identity import fields
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.pack_model import PackModelHealth
@@ -27,7 +28,7 @@ from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sources.source import ReceivedSamples
@@ -109,16 +110,24 @@ class Result:
 
 
 async def run_service(
-    samples: SampleBlock, folder: Path | None = None, settings: Settings = SETTINGS, **options: Any
+    samples: SampleBlock,
+    folder: Path | None = None,
+    settings: Settings = SETTINGS,
+    source: ScriptedSource | None = None,
+    **parts: Any,
 ) -> Result:
-    """Run the service over samples until they end."""
-    files: dict[str, Any] = {}
-    if folder:
-        files = {"checkpoint": CheckpointFile(folder, settings, CELL), "history": HistoryFile(folder, settings, CELL)}
+    """Run the service over samples until they end, with further ``ServiceParts``."""
     sink = Collector()
     with OneThread() as executor:
-        arguments = {"source": DaySource(samples, executor), "fit_executor": executor} | files | options
-        running = run_estimation_loop(settings, CELL, sinks=[sink], stop=asyncio.Event(), **arguments)
+        running = run_estimation_loop(
+            settings,
+            CELL,
+            source=source or DaySource(samples, executor),
+            sinks=[sink],
+            stop=asyncio.Event(),
+            files=StateFiles(folder, settings, CELL) if folder else None,
+            parts=ServiceParts(**{"fit_executor": executor, **parts}),
+        )
         estimator = await asyncio.wait_for(running, LONG_S)
     return Result(estimator, sink)
 
@@ -251,7 +260,7 @@ def same_estimates(first: Estimator, second: Estimator) -> None:
 @pytest.mark.usefixtures("quick")
 async def test_without_the_history_file_the_state_keeps_its_curves(day: SampleBlock, tmp_path: Path) -> None:
     first = await run_service(day[: 5 * HOUR], tmp_path)
-    HistoryFile(tmp_path, SETTINGS, CELL).path.unlink()
+    StateFiles(tmp_path, SETTINGS, CELL).history.path.unlink()
     second = await run_service(day[5 * HOUR : 5 * HOUR + 1], tmp_path)
     assert second.estimator.settings_record.tobytes() == first.estimator.settings_record.tobytes()
     same_estimates(first.estimator, second.estimator)
@@ -278,7 +287,7 @@ async def test_with_the_fit_switched_off_the_curves_are_those_of_the_cell_file(
 @pytest.mark.parametrize("fault", ["damaged", "foreign", "later", "other layout"])
 async def test_an_unusable_history_is_set_aside(day: SampleBlock, tmp_path: Path, fault: str) -> None:
     first = await run_service(day[: 3 * HOUR], tmp_path)
-    path = HistoryFile(tmp_path, SETTINGS, CELL).path
+    path = StateFiles(tmp_path, SETTINGS, CELL).history.path
     with np.load(path) as file:
         content: dict[str, Any] = dict(file)
     if fault == "damaged":
@@ -325,13 +334,12 @@ async def test_without_a_checkpoint_the_fit_of_the_history_is_used(day: SampleBl
 
 async def test_a_checkpoint_of_a_version_without_history_is_restored(tmp_path: Path) -> None:
     settings, cell = Settings.model_validate(FORMAT_7_SETTINGS), load_cell("chen_mora")
-    checkpoint = CheckpointFile(tmp_path, settings, cell)
-    checkpoint.path.write_bytes(FORMAT_7_FILE.read_bytes())
-    files: dict[str, Any] = {"checkpoint": checkpoint, "history": HistoryFile(tmp_path, settings, cell)}
+    files = StateFiles(tmp_path, settings, cell)
+    files.checkpoint.path.write_bytes(FORMAT_7_FILE.read_bytes())
     sink, source = Collector(), ScriptedSource()
     source.give((0.0, 0.0, 3.8))
     source.finish()
-    running = run_estimation_loop(settings, cell, sinks=[sink], stop=asyncio.Event(), source=source, **files)
+    running = run_estimation_loop(settings, cell, sinks=[sink], stop=asyncio.Event(), source=source, files=files)
     estimator = await asyncio.wait_for(running, LONG_S)
     assert sink.snapshots[0].health.checkpoint == "restored: SOC 0.3710"
     assert estimator.record["history"]["segment"][0] >= 1
@@ -370,9 +378,9 @@ async def test_the_state_is_saved_though_the_history_cannot_be(
     def full(*_: Any) -> None:
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(HistoryFile, "save", full)
+    monkeypatch.setattr(ArraysFile, "save", full)
     first = await run_service(day[: 3 * HOUR], tmp_path)
-    assert not HistoryFile(tmp_path, SETTINGS, CELL).path.exists()
+    assert not StateFiles(tmp_path, SETTINGS, CELL).history.path.exists()
     second = await run_service(day[3 * HOUR : 3 * HOUR + 1], tmp_path)
     assert second.sink.snapshots[0].health.checkpoint.startswith("restored")
     same_estimates(first.estimator, second.estimator)

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from tests.patience import LONG_S
@@ -43,9 +42,8 @@ async def run_service(folder: Path, samples: SampleBlock) -> bytes:
             source=source,
             sinks=[],
             stop=asyncio.Event(),
-            checkpoint=CheckpointFile(folder, SETTINGS, CELL),
-            load_file=HistoryFile(folder, SETTINGS, CELL, LOAD_SUFFIX),
-            requests=requests,
+            files=StateFiles(folder, SETTINGS, CELL),
+            parts=ServiceParts(requests=requests),
         ),
         LONG_S,
     )
@@ -66,19 +64,19 @@ async def test_forecast_after_a_restart_uses_the_load_before_it(folder: Path) ->
 
 
 async def test_damaged_load_is_dropped_with_the_reason_and_replaced(folder: Path) -> None:
-    file = HistoryFile(folder, SETTINGS, CELL, LOAD_SUFFIX)
+    file = StateFiles(folder, SETTINGS, CELL).load
     file.path.write_bytes(b"damaged")
     with capture_logs() as lines:
         answer = await run_service(folder, discharge(5))
-    [warning] = [line for line in lines if "observed load" in line["event"]]
-    assert warning["reason"].startswith("damaged")
+    [warning] = [line for line in lines if line["event"] == "load"]
+    assert warning["outcome"].startswith("refused: damaged")
     assert b"less than 300 s of load" in answer
     assert file.load()
 
 
 async def test_state_without_a_saved_load_is_restored(folder: Path) -> None:
     """Earlier versions did not save the load."""
-    HistoryFile(folder, SETTINGS, CELL, LOAD_SUFFIX).path.unlink()
+    StateFiles(folder, SETTINGS, CELL).load.path.unlink()
     with capture_logs() as lines:
         assert b"less than 300 s of load" in await run_service(folder, discharge(5))
     assert any("restored" in str(line.get("outcome")) for line in lines)

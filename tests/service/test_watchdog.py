@@ -10,7 +10,7 @@ import pytest
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service import publisher
 from bms_estimator.service.latency import Latency
-from bms_estimator.service.live_loop import run_estimation_loop
+from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.service.pack_service import recording_health
 from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.sensor import SensorSettings
@@ -69,10 +69,9 @@ def systemd(tmp_path: Path):
 async def test_a_hanging_source_stops_the_watchdog_notifications(systemd: Systemd) -> None:
     health = SourceHealth(task_idle_s=0.0, block_age_s=0.0, queued_reads=0)
     source, sink = ScriptedSource(), Collector()
-    arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
-    task = asyncio.create_task(
-        run_estimation_loop(SETTINGS, CELL, **arguments, status=ServiceStatus(source_health=lambda: health))
-    )
+    arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
+    parts = ServiceParts(ServiceStatus(source_health=lambda: health), notifier=systemd.notifier)
+    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **arguments, parts=parts))
     await systemd.wait_for("WATCHDOG=1")  # no sample arrives, but the source still tries
     health = health._replace(task_idle_s=publisher.SOURCE_HUNG_S + 1.0)
     for _ in range(3):
@@ -114,8 +113,10 @@ async def test_the_idle_time_of_a_source_s_task_grows_while_it_hangs(
 
 async def test_systemctl_status_shows_the_soc_or_the_reason_for_missing_samples(systemd: Systemd) -> None:
     source, sink = ScriptedSource(), Collector()
-    arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event(), "notifier": systemd.notifier}
-    task = asyncio.create_task(run_estimation_loop(SETTINGS, CELL, **arguments))
+    arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
+    task = asyncio.create_task(
+        run_estimation_loop(SETTINGS, CELL, **arguments, parts=ServiceParts(notifier=systemd.notifier))
+    )
     assert await systemd.wait_for("READY=1") == "READY=1\nSTATUS=estimating pack"
     source.silence_reason = "waiting for /dev/none: it does not exist"
     await systemd.wait_for("STATUS=estimating pack: no samples: ")
@@ -129,7 +130,9 @@ async def test_health_contains_the_latency_of_samples_and_the_number_of_waiting_
     source, sink = ScriptedSource(), Collector()
     health = SourceHealth(task_idle_s=0.0, block_age_s=0.3, queued_reads=7)
     arguments = {"source": source, "sinks": [sink], "stop": asyncio.Event()}
-    live = run_estimation_loop(SETTINGS, CELL, **arguments, status=ServiceStatus(source_health=lambda: health))
+    live = run_estimation_loop(
+        SETTINGS, CELL, **arguments, parts=ServiceParts(ServiceStatus(source_health=lambda: health))
+    )
     task = asyncio.create_task(live)
     first = await sink.until(lambda _: True)
     assert first.health.loop.latency_p50_s is None

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.identity import fields
-from bms_estimator.checkpoint.restore import restore_state
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings

@@ -16,8 +16,9 @@ from typing import Any, Self
 
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import REJECTED, CheckpointContent, CheckpointFile
+from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.pack.state import REFUSED, PackState
 from bms_estimator.service import pack_service as service
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings
@@ -651,10 +652,11 @@ class World:
         """Check that no checkpoint is rejected at a start."""
         load = CheckpointFile.load
 
-        def load_and_check(file: CheckpointFile) -> CheckpointContent:
+        def load_and_check(file: CheckpointFile) -> PackState:
             content = load(file)
-            if content.reason.startswith(REJECTED):
-                self.fail(f"the checkpoint is {content.reason}")
+            for reason in content.reasons.values():
+                if reason.startswith(REFUSED):
+                    self.fail(f"the checkpoint is {reason}")
             return content
 
         CheckpointFile.load = load_and_check

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import HistoryFile as FitHistoryFile
-from bms_estimator.checkpoint.history_file import RejectedHistoryError
-from bms_estimator.checkpoint.learned_state import learned_estimator
+from bms_estimator.checkpoint.arrays_file import RejectedFileError
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import present_elements, relative_capacity
 from bms_estimator.model.arrays import Floats
@@ -50,14 +48,14 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
         raise UserError(f"{path}: no rows in this period; the service stores one for each minute")
     table = np.array(rows, dtype=np.float64)  # None becomes NaN
     columns = dict(zip(Minute._fields, table.T, strict=True))
-    learned: list[tuple[str, str, str]] = []
+    files, learned = StateFiles(path.parent, settings, model), list[tuple[str, str, str]]()
     not_learned = ""
     try:
-        learned = _learned_parameters(settings, model, path.parent)
+        learned = _learned_parameters(files, model)
     except UserError as error:
         not_learned = str(error)
     events = file.events(since_s, until_s)
-    aging = _aging_history(settings, model, path.parent)
+    aging = _aging_history(files, settings, model)
     if aging.course:
         learned = [row for row in learned if row[0] != CAPACITY]  # the table of the slow fit has the capacity
     warnings = _implausible_voltages(model, columns["voltage_v"], path)
@@ -80,11 +78,11 @@ def _implausible_voltages(model: PackModel, voltage_v: Floats, path: Path) -> li
     return [text]
 
 
-def _aging_history(settings: Settings, model: PackModel, folder: Path) -> AgingHistory:
+def _aging_history(files: StateFiles, settings: Settings, model: PackModel) -> AgingHistory:
     """Return capacity and resistances over the days of the history to which the service fits the pack's model."""
     if isinstance(model, FuelCellModel):
         return AgingHistory(None, "Only batteries have a capacity and resistances over days.")
-    file = FitHistoryFile(folder, settings, model)
+    file = files.history
     try:
         arrays = file.load()
         rows, fit = history_of(arrays) if arrays else (None, None)
@@ -95,11 +93,11 @@ def _aging_history(settings: Settings, model: PackModel, folder: Path) -> AgingH
             )
         cell = CellCurves(new_estimator(settings, model).cell_file_settings)
         return AgingHistory(aging_course(cell, rows.rows, fit))
-    except (RejectedHistoryError, OSError, ValueError) as error:
+    except (RejectedFileError, OSError, ValueError) as error:
         return AgingHistory(None, f"{file.path} cannot be used: {error}.")
 
 
-def _learned_parameters(settings: Settings, model: PackModel, folder: Path) -> list[tuple[str, str, str]]:
+def _learned_parameters(files: StateFiles, model: PackModel) -> list[tuple[str, str, str]]:
     """Return name, value and std of the learned capacity and circuit elements.
 
     Raises:
@@ -107,7 +105,7 @@ def _learned_parameters(settings: Settings, model: PackModel, folder: Path) -> l
     """
     if isinstance(model, FuelCellModel):
         raise UserError("a fuel cell has no capacity and no elements over SOC")
-    estimator = learned_estimator(CheckpointFile(folder, settings, model), settings, model)
+    estimator = files.saved_pack().pack.estimator
     record, rated_ah = estimator.record[0], model.cell.capacity_ah
     capacity = relative_capacity(record)
     rows = [(CAPACITY, number(capacity.value * rated_ah), number(capacity.std * rated_ah, 2))]

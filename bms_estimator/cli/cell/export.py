@@ -9,8 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.learned_state import learned_estimator
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.options.capture_options import (
     AsJson,
     Force,
@@ -66,13 +65,14 @@ def export(
     """
     settings, model = load_pack(pack)
     cell, series = single_cell_of(pack, settings), settings.pack.series
-    file = CheckpointFile(checkpoint.parent if checkpoint else state_folder(settings), settings, model)
+    files = StateFiles(checkpoint.parent if checkpoint else state_folder(settings), settings, model)
+    file = files.checkpoint
     if checkpoint:  # its name may differ from the name that a service gives
         file.path = checkpoint
     check_output_file(out, [pack, file.path], force=force)
     if checkpoint and not checkpoint.exists():
         raise UserError(f"--checkpoint {checkpoint}: no such file")
-    estimator = learned_estimator(file, settings, model)
+    estimator = files.saved_pack().pack.estimator
     learned = identified_cell(estimator, cell, series)
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], TABULATED_SOC)
     correction_v += fitted_ocv_correction(estimator, TABULATED_SOC)

@@ -12,8 +12,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.cli.live.initial_state import InitialState, end_of_capture, saved_state
-from bms_estimator.cli.options.capture_input import capture_file, print_guesses
+from bms_estimator.checkpoint.state_files import SavedPack, StateFiles
+from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     CELL_HELP,
@@ -31,9 +31,15 @@ from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve
 from bms_estimator.forecast.trip import MAX_LOAD, MAX_TRIP_S, Trip, constant_trip
 from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
+from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.pack.pack import new_pack
+from bms_estimator.process.state_folder import state_folder
 from bms_estimator.reports.formats import duration_text, number
 from bms_estimator.service.forecast_request import as_json_data
+from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.captures.replay import open_capture
 from bms_estimator.sources.captures.trip_file import read_trip
 from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 
@@ -123,18 +129,55 @@ def forecast(
         settings = with_pack(settings, cutoff_v=cutoff_v)
     with show_compile_progress():
         if capture is not None:
-            start = end_of_capture(settings, model, capture, current_sign, column_map, has_pack=pack is not None)
+            start = _end_of_capture(settings, model, capture, current_sign, column_map, has_pack=pack is not None)
         else:
-            start = saved_state(settings, model)
-        result = start.forecaster.forecast(trip.load if trip else None)
-        curve = start.forecaster.trip_curve(trip.load) if trip and trip.has_end else None
+            start = StateFiles(state_folder(settings), settings, model).saved_pack()
+        if start.load_reason:
+            typer.echo(f"warning: the observed load is unknown: {start.load_reason}", err=True)
+        forecaster = start.pack.forecaster
+        if forecaster is None:
+            raise UserError(
+                f"{model.cell.name}: a forecast needs a battery, and identifier.enabled = true in the settings"
+            )
+        result = forecaster.forecast(trip.load if trip else None)
+        curve = forecaster.trip_curve(trip.load) if trip and trip.has_end else None
     outcome = trip_outcome(trip, curve) if trip and curve else None
     if plot is not None:
-        _write_plot(plot, start, curve or result.curve)
+        _write_plot(plot, start.name, curve or result.curve, forecaster.cutoff_v)
     if as_json:
-        sys.stdout.write(json.dumps(as_json_data(result, outcome, start.forecaster.cutoff_v)) + "\n")
+        sys.stdout.write(json.dumps(as_json_data(result, outcome, forecaster.cutoff_v)) + "\n")
     else:
-        Console().print(_result_table(start, load_text, result, outcome))
+        Console().print(_result_table(start, forecaster.cutoff_v, load_text, result, outcome))
+
+
+def _end_of_capture(
+    settings: Settings,
+    model: PackModel,
+    capture: Path,
+    current_sign: SignOfCurrent,
+    column_map: MappedColumns,
+    *,
+    has_pack: bool,
+) -> SavedPack:
+    """Return the pack at the end of a capture. The load of the capture is the observed load.
+
+    Raises:
+        UserError: The capture cannot be read or has no usable sample.
+    """
+    with capture_file(capture) as path:
+        source = open_capture(
+            path, settings.sensor if has_pack else None, current_sign=current_sign, column_map=column_map
+        )
+        print_guesses(path.name, source)
+        pack = new_pack(settings, model, has_forecasts=False)
+        slots = CellSlots(model.cell.series_count)
+        with long_file_bar("reading", path) as progress:
+            for samples in source:
+                pack.run(samples, slots.select(source.cells))
+                progress(source.fraction)
+        if not pack.estimator.state["samples"][0]:
+            raise UserError(f"{path}: no usable sample")
+    return SavedPack(path.name, pack)
 
 
 def _trip(
@@ -165,17 +208,19 @@ def _trip(
     return None, "like the observed load"
 
 
-def _result_table(start: InitialState, load: str, forecast: Forecast, outcome: TripOutcome | None) -> Table:
+def _result_table(
+    start: SavedPack, cutoff_v: float, load: str, forecast: Forecast, outcome: TripOutcome | None
+) -> Table:
     """Return the result as a table."""
     table = Table(title=start.name, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column()
-    estimator = start.forecaster.estimator
+    estimator = start.pack.estimator
     rows = {
         "SOC now": f"{estimator.soc:.1%} ± {2.0 * estimator.soc_std:.1%}",
         **_age_row(start.age_s),
         "load": load,
-        f"time to {start.forecaster.cutoff_v:.4g} V": _time_text(forecast),
+        f"time to {cutoff_v:.4g} V": _time_text(forecast),
         **(dict(_trip_rows(outcome)) if outcome else {}),
     }
     for name, value in rows.items():
@@ -213,7 +258,7 @@ def _check_plot_file(plot: Path, inputs: list[Path], *, force: bool) -> None:
     check_output_file(plot, inputs, force=force, option="--plot")
 
 
-def _write_plot(plot: Path, start: InitialState, curve: ForecastCurve | None) -> None:
+def _write_plot(plot: Path, title: str, curve: ForecastCurve | None, cutoff_v: float) -> None:
     """Write a plot of the predicted SOC and voltage to a file.
 
     Raises:
@@ -231,8 +276,8 @@ def _write_plot(plot: Path, start: InitialState, curve: ForecastCurve | None) ->
     with plt.rc_context(STYLE):
         figure, (upper, lower) = plt.subplots(2, 1, figsize=(7.0, 5.0), sharex=True)
         soc_ahead(curve, ax=upper)
-        voltage_ahead(curve, start.forecaster.cutoff_v, ax=lower)
-        figure.suptitle(start.name)
+        voltage_ahead(curve, cutoff_v, ax=lower)
+        figure.suptitle(title)
         try:
             figure.savefig(plot)
         except OSError as error:

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.identity import fields, without_observer
-from bms_estimator.checkpoint.restore import restore_state
+from bms_estimator.checkpoint.identity import without_observer
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.restore import restore_state
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
 from bms_estimator.fleet.worker import cell_summary, hour_summary
@@ -28,6 +28,7 @@ from bms_estimator.fleet.worker.pack_state import (
 from bms_estimator.fleet.worker.single_cells import SingleCells, known_voltages
 from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.forecast.forecast import Forecast, unknown_values
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.model.sample import SampleBlock

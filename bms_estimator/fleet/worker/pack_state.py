@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.identity import fields
-from bms_estimator.checkpoint.restore import copy_known_fields
+from bms_estimator.estimator.restore import copy_known_fields
 from bms_estimator.fleet.worker.cell_summary import CELL_SUMS, MAX_CELLS
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
 from bms_estimator.kernels.cells.records import BANK, CELL
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
+from bms_estimator.model.arrays import fields
 
 Fields = Mapping[str, NDArray[Any]]
 """Fields of a record by name; a nested field is named ``part.field``."""

@@ -1,7 +1,7 @@
 """Builder of MQTT messages from a snapshot and the state already published. Pure: no connection, no clock."""
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -28,6 +28,32 @@ SENSOR_AVAILABILITY = "sensor/availability"
 """Topic of the sensor's availability, below the device's topic."""
 ANNOUNCED_ALARMS = ("collapse_risk",)
 """Alarms with an entity in Home Assistant before their first value, which follows only after minutes of load."""
+
+
+UNRETAINED = "parameters", "forecast"
+"""Topics of ``changed_payloads`` whose messages are not retained."""
+
+
+def changed_payloads(before: Snapshot | None, snapshot: Snapshot) -> Iterator[tuple[str, Payload]]:
+    """Yield topic and payload of each part of a snapshot that has changed, without state and events.
+
+    Args:
+        before: Previous snapshot of the receiver; None for the first one.
+        snapshot: The snapshot.
+    """
+    parameters = snapshot.parameters if snapshot.parameters.elements else None  # none before the first sample
+    for topic in ("parameters", "forecast", "health", "info", "cells"):
+        payload, former = (
+            parameters if topic == "parameters" else getattr(snapshot, topic),
+            getattr(before, topic, None),
+        )
+        # all but info have a publish time, so that each new object is published
+        if payload is not None and payload is not former and (topic != "info" or payload != former):
+            yield topic, payload
+    published = {alarm.name: alarm for alarm in before.alarms} if before else {}
+    for alarm in snapshot.alarms:
+        if alarm != published.get(alarm.name):
+            yield f"alarm/{alarm.name}", alarm
 
 
 class PublishedState(NamedTuple):
@@ -112,31 +138,16 @@ class MessageBuilder:
         Returns:
             The messages, and the state that the broker has after them.
         """
-        _, parameters, health, info, alarms, forecast, cells = snapshot
-        before, messages = sent.snapshot, []
-        has_sample = bool(parameters.elements)
-        # parameters and health have a publish time, so that each new object is published
-        if has_sample and (before is None or before.parameters is not parameters):
-            messages.append(self._live("parameters", parameters.json_bytes))
-        if forecast is not None and (before is None or before.forecast is not forecast):
-            messages.append(self._live("forecast", forecast.json_bytes))
-        if before is None or before.health.sensor_online != health.sensor_online:
-            messages.append(self._sensor(health))
-        if before is None or before.health is not health:
-            messages.append(self._retained("health", health.json_bytes))
-        if before is None or before.info != info:
-            messages.append(self._retained("info", info.json_bytes))
-        if cells is not None and (before is None or before.cells is not cells):
-            messages.append(self._retained("cells", cells.json_bytes))
+        messages, before = [], sent.snapshot
+        for topic, payload in changed_payloads(before, snapshot):
+            if topic == "health" and (before is None or before.health.sensor_online != snapshot.health.sensor_online):
+                messages.append(self._sensor(snapshot.health))
+            messages.append((self._live if topic in UNRETAINED else self._retained)(topic, payload.json_bytes))
         discovery_inputs = self._discovery_inputs(sent, snapshot)
         if discovery_inputs != sent.discovery_inputs:
-            payload = self._discovery(discovery_inputs)
-            if sent.discovery_inputs is None or payload != self._discovery(sent.discovery_inputs):
-                messages.append(
-                    Message(discovery_topic(self._home_settings, self._device), payload, qos=1, retain=True)
-                )
-        published = {alarm.name: alarm for alarm in before.alarms} if before else {}
-        messages += [self._retained(f"alarm/{a.name}", a.json_bytes) for a in alarms if a != published.get(a.name)]
+            text = self._discovery(discovery_inputs)
+            if sent.discovery_inputs is None or text != self._discovery(sent.discovery_inputs):
+                messages.append(Message(discovery_topic(self._home_settings, self._device), text, qos=1, retain=True))
         values, entity_states = self._home_assistant(sent.entity_states, snapshot, discovery_inputs, now_s)
         return messages + values, PublishedState(snapshot, entity_states, discovery_inputs)
 

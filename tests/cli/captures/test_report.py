@@ -12,8 +12,7 @@ import re
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import HistoryFile as FitHistoryFile
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.main import main
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
@@ -148,7 +147,7 @@ def test_page_on_a_history_has_the_learned_parameters_of_the_checkpoint(tmp_path
     settings, model = load_pack(tmp_path / "pack.toml")
     estimator = new_estimator(settings, model)
     estimator.run(load_capture(steps_csv).rows)
-    CheckpointFile(tmp_path, settings, model).save(estimator.record)
+    StateFiles(tmp_path, settings, model).checkpoint.save(estimator.record)
     asyncio.run(record_history(tmp_path / "shed.sqlite", [snapshot_at(0.0), snapshot_at(90.0)]))
     arguments = ("--pack", tmp_path / "pack.toml", "--folder", tmp_path, "--out", tmp_path / "report.html")
     code, _, err = run(capsys, "report", *arguments)
@@ -162,7 +161,7 @@ def report_on_fitted_history(tmp_path, capsys, content):
     """Return the page on a pack with two minutes and the given file of history and fit."""
     (tmp_path / "pack.toml").write_text('[pack]\nname = "shed"\ncell = "nmc"\ncapacity_ah = 3\n')
     settings, model = load_pack(tmp_path / "pack.toml")
-    file = FitHistoryFile(tmp_path, settings, model)
+    file = StateFiles(tmp_path, settings, model).history
     file.save(content)
     asyncio.run(record_history(tmp_path / "shed.sqlite", [snapshot_at(0.0), snapshot_at(90.0)]))
     arguments = ("--pack", tmp_path / "pack.toml", "--folder", tmp_path, "--out", tmp_path / "report.html")

@@ -1,14 +1,16 @@
 """``forecast``: from the checkpoint of a pack, and from the end of a capture."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bms_estimator.checkpoint.arrays_file import LOAD_SUFFIX
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.history_file import LOAD_SUFFIX, HistoryFile
+from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.model.cell import load_cell
@@ -47,7 +49,7 @@ def pack(tmp_path_factory: pytest.TempPathFactory, samples: SampleBlock) -> Path
     assert forecaster
     (folder / "state").mkdir()
     CheckpointFile(folder / "state", settings, cell).save(estimator.record)
-    HistoryFile(folder / "state", settings, cell, LOAD_SUFFIX).save(load_arrays(forecaster.load, forecaster.past))
+    StateFiles(folder / "state", settings, cell).load.save(load_arrays(forecaster.load, forecaster.past))
     return file
 
 
@@ -78,7 +80,7 @@ def copy_pack(pack: Path, folder: Path) -> Path:
 
 def load_file(pack: Path) -> Path:
     """Return the path of the saved load."""
-    return HistoryFile(pack.parent / "state", *load_pack(pack), LOAD_SUFFIX).path
+    return StateFiles(pack.parent / "state", *load_pack(pack)).load.path
 
 
 def run_json(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, object]:
@@ -121,6 +123,7 @@ def test_without_a_saved_load_the_reason_is_printed(
     load_file(copy).unlink()
     code, out, _ = run(capsys, "forecast", copy)
     assert code == 0
+    assert re.search(r"SOC now +\d+\.\d% ± \d+\.\d%", out)
     assert "unknown: less than 300 s of load have been seen" in out
 
 

@@ -6,10 +6,9 @@ The filter stores resistances as ratios to these curves. The ratios are rescaled
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES, resistances
-from bms_estimator.kernels.kalman_filter.input_checks import store_last_good_state
 from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
 from bms_estimator.model.arrays import Floats
@@ -29,32 +28,37 @@ def present_ohm(settings: np.void, f: np.void) -> Floats:
     return ohm
 
 
-def keep_series_resistance(f: np.void, before: Floats, after: Floats) -> None:
-    """Rescale ``step.ln_ratio`` = ln(R_s / R_0), so that R_s keeps its value in ohm when R_0 of the curves changes.
+def use_curves(f: np.void, settings: NDArray[np.void], curves: np.void) -> None:
+    """Replace the curves in the filter's settings, and keep R_s in ohm, which the filter stores relative to R_0 of the curves.
 
     R_s is the series resistance learned from current steps, and R_0 the series resistance of the curves.
 
     Args:
         f: Record of dtype EKF_STATE.
-        before: Resistances of the curves before the change (``present_ohm``).
-        after: Resistances of the curves after the change.
+        settings: Shape (1,), dtype EKF_SETTINGS; written.
+        curves: Record of dtype EKF_SETTINGS with the new curves.
     """
-    f["step"]["ln_ratio"] += math.log(before[0] / after[0])
+    before = present_ohm(settings[0], f)
+    settings[0] = curves
+    if f["started"]:
+        f["step"]["ln_ratio"] += math.log(before[0] / present_ohm(settings[0], f)[0])
 
 
-def return_to_cell_file(estimator: Estimator) -> None:
+def return_to_cell_file(f: np.void, settings: NDArray[np.void], cell_file: np.void) -> None:
     """Replace the curves of a fit by those of the cell file.
 
     SOC, capacity and the resistances at the present SOC do not change. The correction of the OCV is reset to its prior.
+
+    Args:
+        f: Record of dtype EKF_STATE; written.
+        settings: Shape (1,), dtype EKF_SETTINGS; written.
+        cell_file: Record of dtype EKF_SETTINGS with the curves of the cell file.
     """
-    f, settings = estimator.record[0]["filter"], estimator.settings_record["filter"]
-    if not f["started"]:
-        settings[0] = estimator.cell_file_settings
-        return
     before = present_ohm(settings[0], f)
-    settings[0] = estimator.cell_file_settings
+    use_curves(f, settings, cell_file)
+    if not f["started"]:
+        return
     after = present_ohm(settings[0], f)
-    keep_series_resistance(f, before, after)
     variance = float(settings[0]["r_std"]) ** 2
     count = int(f["count"])
     for mean, covariance in zip(f["mean"][:count], f["covariance"][:count], strict=True):
@@ -65,4 +69,3 @@ def return_to_cell_file(estimator: Estimator) -> None:
             covariance[j, :] = covariance[:, j] = 0.0
             covariance[j, j] = variance
         reset_ocv_correction(mean, covariance)
-    store_last_good_state(estimator.record[0]["checks"], f)

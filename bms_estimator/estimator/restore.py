@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.identity import fields
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import OBSERVER_COUNTERS
+from bms_estimator.estimator.estimator import OBSERVER_COUNTERS, Estimator
+from bms_estimator.estimator.history_rows import MAX_SEGMENT, checked_rows
 from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, HISTORY_ROW
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENTS
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
 from bms_estimator.kernels.kalman_filter.mixture import decorrelate_state
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET
-from bms_estimator.pack_model.saved import MAX_SEGMENT, checked_rows
+from bms_estimator.model.arrays import fields
 
 _PARTS_WITHOUT_FILTER = ("observer.", "learning.", "series_resistance.")
 """Prefixes of the fields that are also estimated while the filter is off."""

@@ -1,0 +1,52 @@
+"""Saved state of a pack: arrays by name, and a reason for each part that is missing or refused."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.fuel_cell import PackModel
+
+Arrays = Mapping[str, NDArray[Any]]
+REFUSED = "refused: "
+"""Prefix of the reason for which a part was refused."""
+CHECKPOINT, CURVES, CELLS, HISTORY, LOAD, CAPACITY = "checkpoint", "curves", "cells", "history", "load", "capacity"
+"""Names of the parts in outcomes."""
+
+
+class Declared(NamedTuple):
+    """Values of a battery's model to which learned values are relative."""
+
+    capacity_ah: float
+    r_s_ohm: float
+
+    @classmethod
+    def by(cls, model: PackModel) -> "Declared | None":
+        """Return the values of a model; None for a fuel cell."""
+        return cls(model.cell.capacity_ah, model.r_s.offset_ohm) if isinstance(model, CellModel) else None
+
+
+@dataclass(frozen=True)
+class PackState:
+    """State of a pack at a save. A part that is missing or refused is empty."""
+
+    record: Arrays = field(default_factory=dict)
+    """Fields of ESTIMATOR_STATE by their names, as from ``fields``."""
+    curves: Arrays = field(default_factory=dict)
+    """Arrays of the fit to whose curves ``record`` is relative (``pack_model.saved.curve_arrays``); empty: the curves are those
+    of the cell file."""
+    cells: Arrays = field(default_factory=dict)
+    """State of the estimators of single cells (``CellEstimator.saved_state``); empty without cell voltages."""
+    history: Arrays = field(default_factory=dict)
+    """History and last fit (``pack_model.saved.history_arrays``)."""
+    load: Arrays = field(default_factory=dict)
+    """Observed load (``forecast.saved_load.load_arrays``)."""
+    gap_s: float = math.inf
+    """Time since ``record`` was saved [s]; infinite if unknown."""
+    declared: Declared | None = None
+    """Declared values of the pack at the save; None: the present ones."""
+    reasons: Mapping[str, str] = field(default_factory=dict)
+    """Reason for which a part is empty, by its name; it begins with ``REFUSED`` if the part exists."""
