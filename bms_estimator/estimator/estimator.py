@@ -160,7 +160,7 @@ class Estimator:
 
     @property
     def soc_std(self) -> float:
-        """Standard deviation of ``soc``; NaN without the identifier."""
+        """Standard deviation of the weakest cell about ``soc``, which includes the imbalance; NaN without the identifier."""
         if not (self.identifying and self.state["started"][0]):
             return math.nan
         return float(weakest_cell_soc_std(self.record[0]["filter"], self.settings_record[0]["filter"]))
