@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from bms_estimator.estimator import Estimator, estimate
     from bms_estimator.model.cell import load_cell
     from bms_estimator.model.cell_file import write_cell
+    from bms_estimator.pack.pack import Pack, new_pack
+    from bms_estimator.settings.pack import Settings
     from bms_estimator.sources.captures.replay import load_capture
 
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
@@ -23,23 +25,29 @@ os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 __all__ = [
     "Estimator",
+    "Pack",
+    "Settings",
     "__version__",
     "calibrate",
     "estimate",
     "identify",
     "load_capture",
     "load_cell",
+    "new_pack",
     "validate",
     "write_cell",
 ]
 
 _MODULES = {
     "Estimator": "estimator",
+    "Pack": "pack.pack",
+    "Settings": "settings.pack",
     "calibrate": "calibration.automatic.calibrate",
     "estimate": "estimator",
     "identify": "calibration.elements.identify",
     "load_capture": "sources.captures.replay",
     "load_cell": "model.cell",
+    "new_pack": "pack.pack",
     "validate": "calibration.validate",
     "write_cell": "model.cell_file",
 }

@@ -160,7 +160,7 @@ class Estimator:
 
     @property
     def soc_std(self) -> float:
-        """Standard deviation of ``soc``; NaN without the identifier."""
+        """Standard deviation of the weakest cell about ``soc``, which includes the imbalance; NaN without the identifier."""
         if not (self.identifying and self.state["started"][0]):
             return math.nan
         return float(weakest_cell_soc_std(self.record[0]["filter"], self.settings_record[0]["filter"]))
@@ -227,8 +227,7 @@ class Estimator:
 
     def discard_rows(self) -> None:
         """Discard all history rows, also the present one."""
-        h = self.record[0]["history"]
-        h["count"] = h["sums"]["duration_s"] = 0
+        self.record["history"]["count"] = self.record["history"]["sums"]["duration_s"] = 0
 
     def complete_rows(self) -> NDArray[np.void]:
         """Complete the present history row, and return a copy of all rows of the record."""
@@ -248,9 +247,8 @@ class Estimator:
         h = self.record[0]["history"]
         h["elapsed_s"], h["segment"] = max(h["elapsed_s"], elapsed_s), max(h["segment"], segment) + 1
         h["gap_s"] = gap_s
-        h["count"] = h["direction"] = 0
-        h["charge_as"] = h["charge_variance_as2"] = h["throughput_soc"] = h["direction_s"] = h["row_as"] = 0.0
-        h["hysteresis"] = 0.0
+        h["count"] = h["direction"] = h["direction_s"] = h["charge_as"] = h["charge_variance_as2"] = 0
+        h["throughput_soc"] = h["row_as"] = h["hysteresis"] = 0.0
 
     def forget(self) -> None:
         """Return to the cell file and to the state before the first sample, for another pack. The counters of the samples stay."""

@@ -204,7 +204,7 @@ class Pack:
         return converted
 
     def _restore_record(self, state: PackState, gap_s: float, outcomes: dict[str, str]) -> bool:
-        """Restore the estimator's record. Return False if there is none, or if it is refused."""
+        """Restore the estimator's record. Return False without a valid one."""
         if CHECKPOINT in state.reasons:
             return False
         if reason := restore_state(self.estimator, state.record, gap_s):

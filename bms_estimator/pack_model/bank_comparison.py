@@ -85,7 +85,7 @@ SINCE_FIRST = CommonChange(soc=0.005, capacity=0.05, drop=0.1)
 
 
 @dataclass(frozen=True)
-class WeakestCell:
+class ComparedCell:
     """Estimate of the weakest cell from one discharge."""
 
     soc: float
@@ -104,11 +104,6 @@ class WeakestCell:
     def capacity_ratio(self) -> float:
         """Capacity of the weakest cell relative to the others."""
         return float(1.0 / (1.0 + self.mean[1]))
-
-    @property
-    def empty_soc(self) -> float:
-        """SOC of the other cells at which the weakest cell is empty."""
-        return float((self.mean[0] + self.mean[1]) / (1.0 + self.mean[1]))
 
     def others_soc(self, filter_soc: float) -> float:
         """Return the SOC of the other cells when the filter's SOC of the bank is ``filter_soc``."""
@@ -204,7 +199,7 @@ class Comparison:
         covariance = _covariance(cell, reference, self.measured)
         self.covariance_factor: Floats = np.linalg.cholesky(covariance).astype(np.float64)
 
-    def weakest(self, deviation_v: Floats | None = None) -> WeakestCell:
+    def weakest(self, deviation_v: Floats | None = None) -> ComparedCell:
         """Return the estimate of the weakest cell.
 
         Args:
@@ -220,7 +215,7 @@ class Comparison:
         ln_weight = LN_PRIOR + LIKELIHOOD_EXPONENT * ln_likelihood
         weight = np.exp(ln_weight - ln_weight.max())
         values = np.stack([SHIFT, SHRINK])
-        return WeakestCell(
+        return ComparedCell(
             soc=float(self.measured.soc[-1]),
             filter_soc=self._filter_soc,
             deviation_std=math.sqrt(max(2.0 * float(ln_likelihood.max()), 0.0)),

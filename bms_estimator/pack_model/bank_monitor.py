@@ -11,10 +11,10 @@ from bms_estimator.pack_model.bank_comparison import (
     MIN_ROWS,
     SINCE_EARLIER,
     SINCE_FIRST,
+    ComparedCell,
     Comparison,
     Reference,
     ReferenceCurve,
-    WeakestCell,
 )
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit
@@ -43,7 +43,7 @@ class Discharge:
     start_as: float
     """Charge counter at its first row [A s]."""
 
-    def weakest(self, cell: CellCurves, rows: NDArray[np.void]) -> list[WeakestCell]:
+    def weakest(self, cell: CellCurves, rows: NDArray[np.void]) -> list[ComparedCell]:
         """Return an estimate for each reference.
 
         The SOC of a row is the SOC at the start minus the charge drawn since.
@@ -79,7 +79,7 @@ class BankMonitor:
 
     def reset(self) -> None:
         """Discard all results, as for a new bank."""
-        self.weakest: WeakestCell | None = None
+        self.weakest: ComparedCell | None = None
         self._result_start_s = -np.inf  # time of the first row of the discharge that gave ``weakest`` [s]
         self._result_soc = np.inf  # SOC of the other cells at the last evaluated row of that discharge
         self._discharge: Discharge | None = None
@@ -141,7 +141,7 @@ class BankMonitor:
             if curve is not None:
                 yield Reference(each.fit, curve, change)
 
-    def _update_result(self, result: WeakestCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
+    def _update_result(self, result: ComparedCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
         """Replace the present result by that of a discharge, and update the times of weak cells, unless the discharge is too shallow.
 
         A discharge replaces the result if it shows a weak cell, is as deep as the discharge of the present result, or is that

@@ -222,6 +222,11 @@ class SlowFit:
         self.revision += 1
 
     @property
+    def weak_cell_std(self) -> float:
+        """Significance of a weak cell in the last comparison of a bank [std]; NaN without one."""
+        return self.bank.weakest.deviation_std if self.bank and self.bank.weakest else math.nan
+
+    @property
     def _h(self) -> np.void:
         record: np.void = self.estimator.record[0]["history"]
         return record

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.disk_thread import DiskThread
-from bms_estimator.store.history_reader import HistoryFile
+from bms_estimator.store.history_reader import HistoryReader
 from bms_estimator.store.minute import MINUTE_S
 
 MAX_EVENTS = 50
@@ -80,12 +80,12 @@ class HistoryQuery:
         now_s = self._clock()
         cached_s, text = self._cache.get((pack, span), (0.0, b""))
         if not 0.0 <= now_s - cached_s < MAX_CACHE_AGE_S:
-            text = _query_columns(HistoryFile(self._files[pack]), SPANS[span], now_s)
+            text = _query_columns(HistoryReader(self._files[pack]), SPANS[span], now_s)
             self._cache[pack, span] = now_s, text
         return text
 
 
-def _query_columns(file: HistoryFile, span: Span, now_s: float) -> bytes:
+def _query_columns(file: HistoryReader, span: Span, now_s: float) -> bytes:
     since_s, until_s = now_s - span.length_s, now_s + MINUTE_S
     rows = file.rows(since_s, until_s, span.step_s)
     events = file.events(since_s, until_s)[-MAX_EVENTS:]

@@ -25,7 +25,6 @@ from bms_estimator.telemetry.alarms.sensor_faults import BoardResets
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.impossible import PackBounds
-from bms_estimator.telemetry.weakest_cell_values import weakest_cell_values
 
 if TYPE_CHECKING:
     from bms_estimator.estimator.cell_estimator import CellDeviations
@@ -125,7 +124,9 @@ class AlarmMonitor:
         suspects = InputFault(int(record["checks"]["suspects"]))
         texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
         self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault)
-        self.alarms.evaluate_weak_cell(weakest_cell_values(self._pack.slow_fit).deviation_std, self._arrival_s)
+        self.alarms.evaluate_weak_cell(
+            self._pack.slow_fit.weak_cell_std if self._pack.slow_fit else math.nan, self._arrival_s
+        )
         cells = self._pack.cells.deviations if self._pack.cells else None
         if cells is not None and cells is not self._cells_seen:
             self._cells_seen = cells

@@ -38,7 +38,7 @@ from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import ReadTap
 from bms_estimator.store.database import Database
-from bms_estimator.store.history import History
+from bms_estimator.store.history import HistorySink
 from bms_estimator.store.outbox import Outbox
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ async def run_pack_service(
     delivery = DeliveryStats(store_trouble=lambda: database.reason) if database else DeliveryStats()
     all_sinks = [*sinks, *export_sinks(settings)]
     if database and settings.store.history_days:
-        all_sinks.append(History(database, days=settings.store.history_days))
+        all_sinks.append(HistorySink(database, days=settings.store.history_days))
     requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = KnownBoardFile(folder, settings.pack.name) if folder else None
     board: SerialSource | None = None

@@ -22,7 +22,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
+from bms_estimator.telemetry.cells import make_cells_payload
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
 from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
@@ -33,7 +33,7 @@ from bms_estimator.telemetry.publish_window import Window, WindowSummary
 from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.rest_detector import RestDetector
 from bms_estimator.telemetry.state import make_info_payload, make_state_payload
-from bms_estimator.telemetry.weakest_cell_values import bank_fields, weakest_cell_values
+from bms_estimator.telemetry.weakest_cell import estimate_fields
 
 log = structlog.get_logger(__name__)
 
@@ -240,7 +240,6 @@ class Publisher:
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:
             forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)
-        cell_fields = weakest_cell_fields(self._deviations) if self._deviations else {}
         return make_state_payload(
             window,
             remaining_capacity_ah(self._estimator),
@@ -249,7 +248,7 @@ class Publisher:
             wall_s,
             self._flow,
             capacity_ah,
-            bank_fields(weakest_cell_values(self._pack.slow_fit)) | cell_fields,
+            estimate_fields(self._pack),
         )
 
     def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:

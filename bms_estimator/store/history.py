@@ -58,7 +58,7 @@ _INSERT = (
 )
 
 
-class History:
+class HistorySink:
     """Sink that stores one-minute rows and events.
 
     Args:

@@ -25,7 +25,7 @@ class PastEvent(NamedTuple):
     text: str
 
 
-class HistoryFile:
+class HistoryReader:
     """History database of a pack, opened read-only.
 
     Args:

@@ -12,10 +12,13 @@ def remaining_capacity_ah(estimator: Estimator) -> float:
     Args:
         estimator: Estimator; read only.
     """
-    state, settings = estimator.state[0], estimator.settings[0]
+    state = estimator.state[0]
     if not state["started"] or math.isnan(state["soc"]):
         return math.nan
-    capacity_ah = float(settings["capacity_as"]) / 3600.0
-    if estimator.identifying:
-        capacity_ah *= relative_capacity(estimator.record[0]).value
-    return float(state["soc"]) * capacity_ah
+    return float(state["soc"]) * full_capacity_ah(estimator)
+
+
+def full_capacity_ah(estimator: Estimator) -> float:
+    """Return the learned capacity [Ah], after a sample; without the identifier the declared one."""
+    ratio = relative_capacity(estimator.record[0]).value if estimator.identifying else 1.0
+    return ratio * float(estimator.settings["capacity_as"][0]) / 3600.0

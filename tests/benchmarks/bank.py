@@ -15,7 +15,7 @@ import numpy as np
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.model.arrays import Floats
-from bms_estimator.pack_model.bank_comparison import WeakestCell
+from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.bank_monitor import BankMonitor, is_discharge
 from bms_estimator.pack_model.history import History
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
@@ -43,7 +43,7 @@ class RowResult:
     """Estimate of the weakest cell after one row of a discharge, with the true values."""
 
     step: Step
-    weakest: WeakestCell
+    weakest: ComparedCell
 
     @property
     def error(self) -> float:

@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, ROW_SOC
 from bms_estimator.model.cell import load_cell
-from bms_estimator.pack_model.bank_comparison import WeakestCell
+from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.bank_monitor import BankMonitor, discharge_start, reference_rows
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import SOC, PackFit
@@ -127,8 +127,7 @@ def test_damaged_times_of_weak_cells_are_rejected() -> None:
 
 
 def test_soc_of_an_over_discharged_cell_is_zero() -> None:
-    weakest = WeakestCell(0.1, 0.12, 8.0, np.array([0.0, 0.25]), np.zeros((2, 2)))
-    assert weakest.empty_soc == pytest.approx(0.2)
+    weakest = ComparedCell(0.1, 0.12, 8.0, np.array([0.0, 0.25]), np.zeros((2, 2)))
     assert weakest.capacity_ratio == pytest.approx(0.8)
     assert weakest.weakest_soc(0.12)[0] == 0.0
     assert weakest.weakest_soc(0.62)[0] == pytest.approx(0.6 - 0.25 * 0.4)

@@ -92,5 +92,8 @@ def test_weakest_cell_is_published_with_its_spread(shorted: SimulatedPack) -> No
     assert estimate.weakest_cell_soc == pytest.approx(
         max(float(shorted.bank.soc.min()), 0.0), abs=3.0 * (estimate.weakest_cell_soc_std or 0.0)
     )
+    assert estimate.weakest_cell_capacity == pytest.approx(1.0, abs=0.1)
+    empty_ah = float(shorted.bank.soc.min()) * CAPACITY_AH
+    assert estimate.usable_capacity_to_weakest_ah == pytest.approx(empty_ah, abs=0.1 * CAPACITY_AH)
     assert estimate.cell_soc_spread
     assert estimate.cell_soc_spread == pytest.approx(float(np.ptp(shorted.bank.soc)), abs=0.03)

@@ -18,7 +18,7 @@ import structlog
 from bms_estimator.mqtt.message import Message
 from bms_estimator.store import database as database_module
 from bms_estimator.store.database import FREE_PAGES, Database, StoreError
-from bms_estimator.store.history import History
+from bms_estimator.store.history import HistorySink
 from bms_estimator.store.outbox import Outbox
 from tests.patience import LONG_S
 from tests.sinks.snapshots import CELL_SNAPSHOT
@@ -194,7 +194,7 @@ async def test_shutdown_with_a_hung_disk_has_one_deadline_for_the_writes_of_all_
     may_return = threading.Event()
     async with asyncio.timeout(LONG_S):
         async with Database(path, hang_s=10 * LONG_S) as database:
-            async with Outbox(database, max_messages=10) as outbox, History(database, days=1) as history:
+            async with Outbox(database, max_messages=10) as outbox, HistorySink(database, days=1) as history:
                 hung = asyncio.create_task(database.call(lambda _: may_return.wait(2 * LONG_S)))
                 history.publish(CELL_SNAPSHOT)
                 outbox.put(Message("t", b"", 1, retain=False))

@@ -15,8 +15,8 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.store import database as database_module
 from bms_estimator.store import history as history_module
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.history import History
-from bms_estimator.store.history_reader import HistoryFile, PastEvent
+from bms_estimator.store.history import HistorySink
+from bms_estimator.store.history_reader import HistoryReader, PastEvent
 from bms_estimator.store.minute import Minute
 from tests.doctor.as_user import as_nobody
 from tests.patience import LONG_S
@@ -41,7 +41,7 @@ def snapshot_at(second: float, current_a: float = 2.0, voltage_v: float = 4.0, *
 
 async def record_history(path: Path, snapshots: list[Snapshot], days: int = 366) -> None:
     """Write the snapshots to a history as one run of a service does. ``days`` is the length of the history."""
-    async with Database(path) as database, History(database, days=days) as history:
+    async with Database(path) as database, HistorySink(database, days=days) as history:
         for each in snapshots:
             history.publish(each)
 
@@ -53,11 +53,11 @@ def path(tmp_path: Path) -> Path:
 
 def read_rows(path: Path, step_s: int = 60) -> list[Minute]:
     """Return all rows, aggregated to steps of ``step_s``."""
-    return HistoryFile(path).rows(0.0, 2e10, step_s)
+    return HistoryReader(path).rows(0.0, 2e10, step_s)
 
 
 def past_events(path: Path) -> list[PastEvent]:
-    return HistoryFile(path).events(0.0, 2e10)
+    return HistoryReader(path).events(0.0, 2e10)
 
 
 async def test_row_has_means_extremes_and_sums_of_the_publications(path):
@@ -151,7 +151,7 @@ async def test_events_are_stored_in_order(path):
 
 async def test_event_is_written_before_its_minute_ends(path, monkeypatch):
     monkeypatch.setattr(history_module, "MINUTE_S", 3600)  # no minute ends
-    async with Database(path) as database, History(database, days=366) as history:
+    async with Database(path) as database, HistorySink(database, days=366) as history:
         history.publish(snapshot_at(0.0))
         async with asyncio.timeout(LONG_S):
             while not await asyncio.to_thread(read_or_nothing, lambda: past_events(path)):  # noqa: ASYNC110 - a file
@@ -160,7 +160,7 @@ async def test_event_is_written_before_its_minute_ends(path, monkeypatch):
 
 
 async def test_history_is_read_while_the_service_writes_it(path):
-    async with Database(path) as database, History(database, days=366) as history:
+    async with Database(path) as database, HistorySink(database, days=366) as history:
         history.publish(snapshot_at(0.0))
         history.publish(snapshot_at(60.0))  # ends the minute
         async with asyncio.timeout(LONG_S):
@@ -179,7 +179,7 @@ def read_or_nothing(read: Callable[[], list[Any]]) -> list[Any]:
 async def test_rows_wait_in_memory_while_the_disk_fails(path):
     path.mkdir()
     (path / "file").touch()
-    async with Database(path, retry_s=0.0) as database, History(database, days=366) as history:
+    async with Database(path, retry_s=0.0) as database, HistorySink(database, days=366) as history:
         # otherwise the folder at the path would be renamed
         database._file._quarantine_symlink = leave_in_place  # type: ignore[method-assign]
         history.publish(snapshot_at(0.0))
@@ -225,7 +225,7 @@ class DatabaseWithLostResults(Database):
 async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path, monkeypatch):
     monkeypatch.setattr(history_module, "WRITE_S", 0.0)
     monkeypatch.setattr(history_module, "WRITTEN_ROWS", 2)
-    async with DatabaseWithLostResults(path, retry_s=0.0) as database, History(database, days=366) as history:
+    async with DatabaseWithLostResults(path, retry_s=0.0) as database, HistorySink(database, days=366) as history:
         database.remaining = 2
         for second in range(0, 190, 10):
             history.publish(snapshot_at(float(second)))
@@ -239,7 +239,7 @@ async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path, 
 
 async def test_shutdown_during_a_write_writes_each_row_once(path):
     may_return = threading.Event()
-    async with Database(path) as database, History(database, days=366) as history:
+    async with Database(path) as database, HistorySink(database, days=366) as history:
         history.publish(snapshot_at(0.0))
         busy = asyncio.create_task(database.call(lambda _: may_return.wait(LONG_S)))
         await asyncio.sleep(0)
@@ -269,7 +269,7 @@ class BrokenDatabase(Database):
         raise KeyError("internal")
 
 
-async def publish_forever(history: History) -> None:
+async def publish_forever(history: HistorySink) -> None:
     async with asyncio.timeout(LONG_S):
         while True:
             history.publish(snapshot_at(0.0))
@@ -278,7 +278,7 @@ async def publish_forever(history: History) -> None:
 
 
 async def test_internal_error_of_the_writing_task_is_raised(path):
-    history = await History(BrokenDatabase(path), days=366).__aenter__()
+    history = await HistorySink(BrokenDatabase(path), days=366).__aenter__()
     with pytest.raises(KeyError, match="internal"):
         await publish_forever(history)
 

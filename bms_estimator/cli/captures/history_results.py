@@ -20,7 +20,7 @@ from bms_estimator.reports.aging_group import AgingHistory
 from bms_estimator.reports.formats import number
 from bms_estimator.reports.history_report import PackHistory
 from bms_estimator.settings.pack import Settings
-from bms_estimator.store.history_reader import HistoryFile
+from bms_estimator.store.history_reader import HistoryReader
 from bms_estimator.store.minute import MINUTE_S, Minute
 
 CAPACITY = "capacity [Ah]"
@@ -42,7 +42,7 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
         UserError: The history cannot be read, or has no rows.
     """
     path = (folder or state_folder(settings)) / f"{settings.pack.name}.sqlite"
-    file, until_s = HistoryFile(path), time.time() + MINUTE_S
+    file, until_s = HistoryReader(path), time.time() + MINUTE_S
     rows = file.rows(since_s, until_s, MINUTE_S)
     if not rows:
         raise UserError(f"{path}: no rows in this period; the service stores one for each minute")

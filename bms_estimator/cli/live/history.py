@@ -17,7 +17,7 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.pack import load_settings
-from bms_estimator.store.history_reader import HistoryFile, PastEvent
+from bms_estimator.store.history_reader import HistoryReader, PastEvent
 from bms_estimator.store.minute import MINUTE_S, Minute
 
 TIME_EXAMPLE = "2026-01-31 or 2026-01-31T12:00"
@@ -66,7 +66,7 @@ def history(
     since_s = since.replace(tzinfo=UTC).timestamp() if since else 0.0
     until_s = until.replace(tzinfo=UTC).timestamp() if until else time.time() + MINUTE_S
     header: Sequence[str] = PastEvent._fields if events else Minute._fields
-    history_file = HistoryFile(path)
+    history_file = HistoryReader(path)
     rows = history_file.events(since_s, until_s) if events else history_file.rows(since_s, until_s, step)
     try:
         with out.open("w", encoding="utf-8", newline="") if out else nullcontext(sys.stdout) as table:

@@ -6,7 +6,7 @@ import io
 import pytest
 
 from bms_estimator.store.database import Database
-from bms_estimator.store.history import History
+from bms_estimator.store.history import HistorySink
 from tests.command_line import run
 from tests.store.test_history import record_history, snapshot_at
 
@@ -48,7 +48,7 @@ def test_events_are_printed(pack, capsys):
 
 
 async def test_history_is_read_while_the_service_runs(pack, capsys):
-    async with Database(pack.with_name("pack.sqlite")) as database, History(database, days=1) as history:
+    async with Database(pack.with_name("pack.sqlite")) as database, HistorySink(database, days=1) as history:
         history.publish(snapshot_at(600.0))  # its minute has not ended, and has no row yet
         await history._write()
         code, out, _ = run(capsys, "history", pack)
