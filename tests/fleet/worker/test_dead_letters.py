@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
@@ -40,6 +41,7 @@ def lethal(pack: str, number: int) -> bytes:
     return encode(Block(store_created_ns=STORE_ID_NS, number=number, oldest=1, arrival_s=1.79e9, samples=rows))
 
 
+@pytest.mark.thorough
 async def test_block_that_kills_its_workers_is_skipped_and_stored_as_a_dead_letter(
     nc, cluster, heartbeats, tmp_path
 ) -> None:
@@ -66,6 +68,7 @@ async def test_block_that_kills_its_workers_is_skipped_and_stored_as_a_dead_lett
     assert partition.state("p1")["estimator"].tobytes() == estimator.record.tobytes()
 
 
+@pytest.mark.thorough
 async def test_blocks_of_a_later_version_are_processed_by_a_replay_after_the_upgrade_of_the_workers(
     nc, cluster, heartbeats, tmp_path
 ) -> None:

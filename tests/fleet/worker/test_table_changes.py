@@ -130,6 +130,7 @@ def test_damaged_change_is_counted_and_skipped(damaged: bytes) -> None:
     assert (partition.sequence, partition.counters["damaged"]) == (1, 1)
 
 
+@pytest.mark.thorough
 async def test_successor_of_a_killed_worker_applies_a_changed_row_between_the_same_blocks(tmp_path: Path) -> None:
     with running(tmp_path, partitions=1) as cluster:
         nc = await nats.connect(cluster.url)
