@@ -138,7 +138,7 @@ def pack(tmp_path):
     [
         ("rest", 1.0, False),
         pytest.param("discharge", 0.0, False, marks=pytest.mark.thorough),
-        ("discharge", 1.0, True),
+        pytest.param("discharge", 1.0, True, marks=pytest.mark.thorough),
     ],
 )
 async def test_after_a_kill_the_test_continues_unless_charge_may_be_missing(
@@ -180,6 +180,7 @@ async def test_a_signal_disconnects_the_load_and_ends_with_code_130(pack, tmp_pa
     assert "the same command continues" in err.decode()
 
 
+@pytest.mark.thorough
 async def test_a_port_that_another_program_reads_is_an_error(pack, tmp_path) -> None:
     async with calibration(tmp_path):
         await pack.advance(until=lambda: pack.is_loaded)
