@@ -162,6 +162,7 @@ def test_rc_pairs_that_a_slow_capture_does_not_determine_have_small_positive_res
     assert 1.0 < sections["r_ts"].offset_ohm * sections["c_ts"].offset_farad < 30.0
 
 
+@pytest.mark.thorough
 def test_a_capture_is_held_back_from_its_score_if_another_has_a_similar_temperature(warm, cold):
     other = Columns(ladder_capture(steps(5), WARM_C + 3.0), "other")
     result = identify([warm, cold, other], wrong_start())

@@ -205,6 +205,7 @@ def test_one_capture_of_a_leaf_cell_gives_a_cell_file_with_a_verdict(capsys, dat
     assert "Validated on the last 30 %" in out.read_text()
 
 
+@pytest.mark.thorough
 def test_a_capture_of_a_pack_from_standard_input_is_scaled_to_one_cell(capsys, monkeypatch, data, tmp_path) -> None:
     rows = [line.split(",") for line in _text_of(data / "lgm50" / "rate_0p1c_25c.csv.gz").splitlines()]
     voltage = rows[0].index("voltage_v")

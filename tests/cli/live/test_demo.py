@@ -71,6 +71,7 @@ async def test_client_receives_states_from_start_to_offline():
     assert "Traceback" not in err
 
 
+@pytest.mark.thorough
 async def test_the_method_of_the_thesis_runs_alone_and_moves_its_parameters_to_the_limits_of_their_bounds():
     port = free_port()
     async with demo("--thesis", "--speed", 5, "--rate-hz", 20, "--port", port) as process:

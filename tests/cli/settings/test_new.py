@@ -261,6 +261,7 @@ async def wait_for_node(broker: Broker) -> None:
         await listener.wait("jk-bms/sensor/jk-bms_temperature_sensor_1/state")
 
 
+@pytest.mark.thorough
 def test_a_publisher_at_the_broker_is_found_with_its_values(broker, file):
     simulated = [PROGRAM, "simulate", "--mqtt", broker.url, "--cell", "lfp", "--capacity-ah", "100", "--series", "16"]
     answers = options(series=None, parallel=None, broker=None)
