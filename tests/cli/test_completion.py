@@ -67,6 +67,7 @@ def test_bash_completes_cells_of_a_battery(bash_home: dict[str, str]) -> None:
     assert complete(bash_home, "adapt", "run.csv", "--cell", "pem") == []
 
 
+@pytest.mark.thorough
 def test_bash_completes_fuel_cells_where_they_are_allowed(bash_home: dict[str, str]) -> None:
     assert complete(bash_home, "replay", "run.csv", "--cell", "pem") == ["pem_30w"]
 

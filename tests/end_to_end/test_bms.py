@@ -20,6 +20,7 @@ MIN_SAMPLES = 5
 """Number of samples after which the published state is checked."""
 
 
+@pytest.mark.thorough
 async def test_soc_and_cell_voltages_of_a_jk_bms_are_published(tmp_path: Path, broker: Broker) -> None:
     simulated_pack = SimulatedPack(load_cell("lfp", 100.0).pack(CELL_COUNT, 1), constant(LOAD_A), soc=START_SOC)
     simulated_bms = SimulatedBms("jk", simulated_pack, cells=CELL_COUNT, soc=lambda: simulated_pack.soc)

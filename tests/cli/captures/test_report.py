@@ -93,6 +93,7 @@ def test_page_loads_nothing_and_ids_are_unique(page):
     assert len(sections) == len(set(sections)) > 5
 
 
+@pytest.mark.thorough
 def test_several_captures_have_a_section_and_a_verdict_each(tmp_path, capsys, steps_csv):
     other = write_table(tmp_path / "other.csv", capture(steps(seed=3)))
     code, _, _ = run(capsys, "report", steps_csv, other, "--cell", "ncr18650", "--out", tmp_path / "report.html")

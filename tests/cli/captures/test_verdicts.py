@@ -161,6 +161,7 @@ def test_all_commands_give_the_grade_of_the_calibration_on_its_own_capture(capsy
     assert (validated["grade"], on_page) == (calibrated["grade"], calibrated["grade"])
 
 
+@pytest.mark.thorough
 def test_another_capture_is_not_called_fitted(capsys, tmp_path):
     out = tmp_path / "own.toml"
     path = write_table(tmp_path / "own.csv", good())

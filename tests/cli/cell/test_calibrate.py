@@ -286,6 +286,7 @@ def test_series_and_temperature_reach_fit_validation_and_report(capsys, data, tm
     assert "temperatures other than 10 °C" in report.read_text(encoding="utf-8")
 
 
+@pytest.mark.thorough
 def test_the_soc_at_the_start_of_a_partial_discharge_is_asked_for_and_reaches_fit_and_report(capsys, tmp_path) -> None:
     cell, begin_soc = load_cell("nmc", 40.0), 0.8
     current_a = np.r_[np.zeros(30), np.full(round(begin_soc * 9.0 * 60.0), 40.0 / 9.0), np.zeros(30)]

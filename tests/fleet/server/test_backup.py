@@ -45,6 +45,7 @@ async def numbers(nc: Client, pack: str) -> list[int]:
         return [decode(message.data).number async for batch in batches for message in batch]
 
 
+@pytest.mark.thorough
 async def test_worker_continues_after_a_restoration_as_if_only_blocks_that_no_edge_has_were_missing(
     tmp_path: Path,
 ) -> None:
