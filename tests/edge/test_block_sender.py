@@ -22,7 +22,7 @@ from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 WALL_S = 1.7e9
 """Wall clock at the start [s since 1970]."""
@@ -90,12 +90,6 @@ def equal(first: SampleBlock, second: SampleBlock) -> bool:
 
 def url(engine: NatsCluster) -> str:
     return f"mqtt://127.0.0.1:{engine.mqtt_port}"
-
-
-async def until(condition) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - counters have no event
-            await asyncio.sleep(0.01)
 
 
 @pytest.mark.parametrize("cells", [False, True])

@@ -20,7 +20,7 @@ from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.collector import Collector
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 from tests.serial_line import Line
 
 CELL = load_cell("chen_mora")
@@ -111,9 +111,7 @@ async def service(
     sink, stop = Collector(), asyncio.Event()
     pack = CELL.pack(series, 1)
     task = asyncio.create_task(run_estimation_loop(settings, pack, source=board, sinks=[sink], stop=stop))
-    async with asyncio.timeout(LONG_S):
-        while "no frame yet" not in (board.silence_reason or ""):  # noqa: ASYNC110 - the board has no event for it
-            await asyncio.sleep(0.01)
+    await until(lambda: "no frame yet" in (board.silence_reason or ""))
     line.write(hello)
     try:
         yield Service(line, sink, task, stop, clock)

@@ -18,8 +18,8 @@ from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.board_check import MAX_PENDING_READS, BoardCheck, OtherBoardError
 from bms_estimator.sources.serial.serial_source import SerialSource
+from tests.patience import until
 from tests.serial_line import Line
-from tests.sources.serial.test_pinned_board import until
 
 PACK_V = 22.2
 PERIOD_S = 0.01

@@ -7,7 +7,7 @@ import os
 import shutil
 import stat
 import tty
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +26,13 @@ from bms_estimator.sources.serial import board_check, port_list, serial_source
 from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.command_line import run
-from tests.patience import LONG_S
+from tests.patience import until
 from tests.serial_line import usb_port
 
 OURS_V, OTHERS_V = 22.2, 11.1
 """Voltages that the pack's board and another board measure [V]. By default they have serial numbers 1 and 2."""
 BOARD_42 = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
 """Stored fields of a board with serial number 42."""
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - the condition is the test's
-            await asyncio.sleep(0.01)
 
 
 @pytest.fixture
