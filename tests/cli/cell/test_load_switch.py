@@ -7,7 +7,8 @@ import pytest
 
 from bms_estimator.cli.cell.load_switch import LoadSwitch, relay_program
 from bms_estimator.model.errors import UserError
-from tests.patience import end, until
+from bms_estimator.process.tasks import end
+from tests.patience import until
 
 
 def program(folder: Path, text: str) -> str:
