@@ -157,6 +157,7 @@ async def test_samples_keep_their_period_if_a_new_store_begins_later_than_the_wa
     assert third.samples["time_s"].tolist() == [*np.arange(60.0, 120.0)]
 
 
+@pytest.mark.thorough
 async def test_no_sample_is_lost_when_the_server_is_killed(tmp_path: Path) -> None:
     with running(tmp_path, partitions=4) as engine:
         async with Receiver(engine.url, "pack") as receiver:

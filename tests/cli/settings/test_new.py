@@ -120,6 +120,7 @@ def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
     assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
 
 
+@pytest.mark.thorough
 def test_an_interrupt_at_a_prompt_ends_with_code_130_and_writes_nothing(file):
     with running_device(jk_bms()) as path, PseudoTerminal("new", str(file), "--search", path, columns=200) as terminal:
         terminal.until(lambda: "Number of the device" in plain(terminal.output))
