@@ -10,7 +10,6 @@ import time
 import numpy as np
 import pytest
 
-from bms_estimator.cli.main import main
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import read_capture, read_header
@@ -82,10 +81,8 @@ def has_a_second(path):
 
 def replay(capsys, path):
     """Replay a capture. Return exit code, summary and stderr."""
-    with pytest.raises(SystemExit) as ended:
-        main(["replay", str(path), "--cell", "chen_mora", "--json"])
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, json.loads(out), err
+    code, out, err = run(capsys, "replay", path, "--cell", "chen_mora", "--json")
+    return code, json.loads(out), err
 
 
 def test_all_bytes_are_recorded_until_ctrl_c(line: Line, tmp_path, capsys):
@@ -159,9 +156,7 @@ def test_recording_ends_after_the_duration(board, tmp_path, capsys):
 
 def test_replayed_samples_have_the_period_of_the_board(capture, tmp_path, capsys):
     table = tmp_path / "one.csv"
-    with pytest.raises(SystemExit):
-        main(["replay", str(capture), "--cell", "chen_mora", "--out", str(table)])
-    capsys.readouterr()
+    assert run(capsys, "replay", capture, "--cell", "chen_mora", "--out", table)[0] == 0
     times = np.loadtxt(table, delimiter=",", skiprows=1, usecols=0)
     assert times.size == sample_count(capture)
     assert np.allclose(np.diff(times), 1 / 100, rtol=0.0, atol=1e-5)
