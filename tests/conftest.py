@@ -7,6 +7,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+import structlog
 from hypothesis import HealthCheck, settings
 
 from bms_estimator.service.kernel_warm_up import load_kernels
@@ -27,6 +28,13 @@ settings.load_profile("short")
 # OpenBLAS threads wait for each other in busy loops. With several workers that takes three times the CPU time of one
 # thread. Workers and the programs that tests start inherit the environment.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# The default renderer prints the local variables of each frame of a logged exception, which takes up to a second.
+structlog.configure(
+    processors=[
+        *structlog.get_config()["processors"][:-1],
+        structlog.dev.ConsoleRenderer(exception_formatter=structlog.dev.plain_traceback),
+    ]
+)
 # Without byte code, each worker and each started program compiles all modules again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
