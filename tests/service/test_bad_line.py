@@ -133,6 +133,18 @@ async def test_samples_are_scaled_by_the_hello_and_info_has_its_serial_number(li
     assert first_info.info.board["serial"] == "0000beef"
 
 
+async def test_a_frame_with_a_wrong_checksum_is_counted_and_dropped(line: Line) -> None:
+    async with service(line) as live:
+        damaged_frame = bytearray(sample(1).encode())
+        damaged_frame[7] ^= 0x10  # any bit
+        live.line.write(frames(0, 1) + bytes(damaged_frame) + frames(2, 8))
+        await live.wait_for_frames(9)
+        _, health = await live.end()
+    assert health.line["crc_errors"] == 1
+    assert health.line["frames_lost"] == 1
+    assert live.sink.snapshots[-1].estimate is None or live.sink.snapshots[-1].estimate.crc_errors == 1
+
+
 async def test_a_board_with_a_newer_protocol_is_reported(line: Line) -> None:
     async with service(line, hello=HELLO.encode(version=2)) as live:
         live.line.write(sample(0).encode(version=2))

@@ -225,6 +225,42 @@ def test_kinds_of_captures_are_recognized_and_combined_to_one_curve(tmp_path, ca
         assert words in text + out.read_text()
 
 
+@pytest.mark.parametrize("direction", ["dis", pytest.param("chg", marks=pytest.mark.thorough)])
+def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, capsys, shared_data, direction):
+    """On a plateau, the hysteresis corresponds to 0.1 of SOC or more, so the curve is shifted by the hysteresis of the generic
+    cell."""
+    folder, out, pair = shared_data / "a123", tmp_path / "lone.toml", tmp_path / "pair.toml"
+    files = {name: folder / f"c30_{name}_p25.csv.gz" for name in ("dis", "chg")}
+    for captures, cell_file in (([files[direction]], out), (list(files.values()), pair)):
+        assert run(capsys, "ocv", *captures, "--capacity-ah", "2.05", "--out", cell_file)[0] == 0
+    unpaired, paired = load_cell(out).ocv, load_cell(pair).ocv
+    inside = (np.array(paired.soc) > 0.15) & (np.array(paired.soc) < 0.95)
+    deviation_v = np.abs(np.array(unpaired.ocv_v) - np.array(paired.ocv_v))[inside]
+    assert (deviation_v < 2.0 * np.array(unpaired.error_v)[inside]).mean() > 0.95
+    assert unpaired.hysteresis_v == pytest.approx(np.full(len(unpaired.soc), 0.01))
+    assert "Hysteresis: that of the generic lfp" in out.read_text()
+    assert "Hysteresis" not in pair.read_text()
+    assert "Elements: those of the generic lfp" in out.read_text()
+
+
+def test_unpaired_slow_curve_of_a_layered_oxide_is_corrected(tmp_path, capsys, data):
+    """The LG M50's discharge at C/10 is on average 17 mV below the published curve. The correction for the RC pairs halves that."""
+    out, folder = tmp_path / "lone.toml", data / "lgm50"
+    code, text, _ = run(capsys, "ocv", folder / "rate_0p1c_25c.csv.gz", "--out", out)
+    assert code == 0
+    assert "subtracted for" in text
+    ocv = load_cell(out).ocv
+    assert ocv.hysteresis_v is None
+    published = np.genfromtxt(folder / "ocv_25c.csv", delimiter=",", names=True)
+    soc = np.linspace(0.15, 0.95, 81)
+    deviation_v = np.interp(soc, ocv.soc, ocv.ocv_v) - np.interp(soc, published["soc"], published["ocv_v"])
+    assert abs(deviation_v.mean()) < 5e-3
+    assert np.sqrt(np.mean(deviation_v**2)) < 10e-3
+    # resistances with weak temperature dependence
+    ladder, generic = load_cell(out).ladder, load_cell("nca", 4.945).ladder
+    assert np.array(ladder.weak_ohm) == pytest.approx(np.array(generic.weak_ohm), rel=1e-3)
+
+
 def test_curve_that_falls_to_0_v_is_rejected(tmp_path, capsys, shared_data):
     """With a declared capacity of 4 Ah instead of 2.9 Ah, the points end far from empty."""
     capture = shared_data / "panasonic18650pf" / "25_hppc.csv.gz"

@@ -12,7 +12,7 @@ import pytest
 
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
-from bms_estimator.sources.captures.raw_capture import read_capture, read_header
+from bms_estimator.sources.captures.raw_capture import MAGIC, read_capture, read_header
 from tests.command_line import PROGRAM, run
 from tests.patience import LONG_S
 from tests.serial_line import Line
@@ -193,3 +193,33 @@ def test_existing_file_is_not_overwritten(tmp_path, capsys):
     message = f"error: {out}: exists already; a capture is never overwritten\n"
     assert run(capsys, "record", out, "--port", "/dev/none") == (2, "", message)
     assert out.read_bytes() == b"kept"
+
+
+@pytest.mark.thorough
+def test_full_disk_ends_the_recording_and_the_file_is_readable(board, tmp_path, capsys):
+    out = tmp_path / "full.bms"
+    limit = ["bash", "-c", 'ulimit -f 4; exec "$0" "$@"']  # 4 KiB
+    command = [*limit, PROGRAM, "record", out, "--port", board]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=LONG_S, check=False)
+    assert ended.returncode == 2
+    assert "error: recording ended: File too large\n" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert size_bytes(out) <= 4 * 1024
+    code, result, err = replay(capsys, out)
+    assert code == 0
+    assert result["samples"] == sample_count(out) > 10
+    header_bytes = len(MAGIC) + 4 + int.from_bytes(out.read_bytes()[len(MAGIC) :][:4], "little") + 2
+    unread = size_bytes(out) - header_bytes - sum(RECORD_OVERHEAD_BYTES + len(data) for _, data in complete_reads(out))
+    message = f"warning: {out}: the last {unread:,} bytes are no complete record"
+    assert (message in err) == (unread > 0)  # the limit may lie between two records
+
+
+@pytest.mark.thorough
+def test_missing_board_is_reported(tmp_path):
+    with program("record", tmp_path / "none.bms", "--port", tmp_path / "none") as process:
+        assert f"waiting for {tmp_path / 'none'}: it does not exist" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=LONG_S)
+    assert process.returncode == 0
+    assert "0 bytes, 0 frames" in err
+    assert complete_reads(tmp_path / "none.bms") == []

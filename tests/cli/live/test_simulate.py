@@ -15,8 +15,9 @@ import pytest
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
-from bms_estimator.protocols.firmware.messages import set_rate_command
+from bms_estimator.protocols.firmware.messages import set_rate_command, set_relay_command
 from tests.command_line import PROGRAM, run
 from tests.patience import LONG_S
 
@@ -107,6 +108,26 @@ def test_options_of_batteries_are_rejected_for_a_fuel_cell(option, capsys):
     code, _, err = run(capsys, "simulate", "--cell", "pem_30w", *option)
     assert code == 2
     assert "--cell pem_30w: a fuel cell is simulated on a board without relay; omit --capacity-ah" in err
+
+
+@pytest.mark.thorough
+def test_the_relay_of_the_board_connects_the_load():
+    with simulate("--load", "relay", "--current-a", "0.5", "--noise-lsb", "0") as (_, path), open_line(path) as line:
+        data = read(line, lambda data: decode(data)[0].size >= 10)
+        assert abs(decode(data)[0]["current_a"]).max() < 0.1
+        os.write(line, set_relay_command(Relay(high=True, high_when_silent=None)))
+        read(line, lambda data: decode(data)[0]["current_a"][-1] == pytest.approx(0.5, abs=0.05), data)
+
+
+@pytest.mark.thorough
+def test_text_lines_have_the_format_of_a_sketch():
+    with simulate("--text", "--current-a", "0.2", "--load", "constant") as (process, path):
+        with open_line(path) as line:
+            lines = read(line, lambda data: data.count(b"\r\n") >= 20).split(b"\r\n")[:-1]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(LONG_S) == 0
+    assert [line for line in lines if not re.fullmatch(rb"\d\.\d{3},-?\d\.\d{3}(,-?\d+\.\d)?", line)] == []
+    assert np.mean([float(line.split(b",")[1]) for line in lines]) == pytest.approx(0.2, abs=0.05)
 
 
 def test_simulation_ends_after_the_simulated_duration(capsys):
