@@ -23,7 +23,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month bank cells observability power resolution unseen nats ble chapter5 ablation ablation-weeks learning forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
+.PHONY: help venv apt audit check deb docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month bank cells observability power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -130,9 +130,6 @@ ablation: venv ## ablation of the filter on real captures, e.g. make ablation AR
 
 ablation-weeks: venv ## ablation of the slow fit over simulated weeks, e.g. make ablation-weeks ARGS="solar --parts slow Huber": hours
 	@$(BIN)/python -m tests.benchmarks.weeks $(ARGS)
-
-learning: venv ## ablation of the learning law, simulated
-	@$(BIN)/python -m tests.benchmarks.thesis.learning_law
 
 fuzz: venv ## edited inputs to all readers of foreign bytes, e.g. make fuzz INPUTS=1000 ARGS="-k jbd": half an hour
 	INPUTS=$(INPUTS) $(BIN)/python -m pytest --numprocesses=2 --hypothesis-profile=long --timeout=7200 --show-capture=no tests/fuzz $(ARGS)

@@ -16,7 +16,7 @@ from tests.fleet.nats_cluster import NatsCluster
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
 from tests.page.house import Service, start_program
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 DESCRIPTORS = 1024
 """Soft limit of open files of a process on most systems."""
@@ -150,10 +150,8 @@ async def _wait_for_link(url: str, *, up: bool) -> None:
 
 async def _wait_for_checkpoint(folder: Path) -> None:
     """Wait for a checkpoint that is newer than the present one."""
-    async with asyncio.timeout(LONG_S):
-        before = _checkpoint_time_s(folder)
-        while _checkpoint_time_s(folder) <= before:  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.05)
+    before = _checkpoint_time_s(folder)
+    await until(lambda: _checkpoint_time_s(folder) > before)
 
 
 def _checkpoint_time_s(folder: Path) -> float:

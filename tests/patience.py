@@ -1,13 +1,14 @@
-"""Timeout of tests."""
+"""Timeout of tests, and waiting for conditions."""
 
 import asyncio
+from collections.abc import Callable
 
 LONG_S = 240.0
 """Timeout that only a hang reaches [s]. A busy machine may compile kernels for minutes."""
 
 
-async def end(task: asyncio.Task[None]) -> None:
-    """Cancel a task until it has ended, because wait_for of Python 3.11 may swallow one cancellation."""
-    while not task.done():
-        task.cancel()
-        await asyncio.wait({task}, timeout=0.1)
+async def until(condition: Callable[[], object]) -> None:
+    """Wait until ``condition`` returns something true."""
+    async with asyncio.timeout(LONG_S):
+        while not condition():  # noqa: ASYNC110 - files, counters and other processes have no event
+            await asyncio.sleep(0.01)

@@ -56,7 +56,6 @@ def complete(environment: dict[str, str], *words: str) -> list[str]:
 
 def test_bash_completes_commands(bash_home: dict[str, str]) -> None:
     assert complete(bash_home, "re") == ["replay", "record", "report"]
-    assert complete(bash_home, "fleet", "wo") == ["worker"]
 
 
 def test_bash_completes_options(bash_home: dict[str, str]) -> None:
@@ -68,9 +67,9 @@ def test_bash_completes_cells_of_a_battery(bash_home: dict[str, str]) -> None:
     assert complete(bash_home, "adapt", "run.csv", "--cell", "pem") == []
 
 
+@pytest.mark.thorough
 def test_bash_completes_fuel_cells_where_they_are_allowed(bash_home: dict[str, str]) -> None:
     assert complete(bash_home, "replay", "run.csv", "--cell", "pem") == ["pem_30w"]
-    assert complete(bash_home, "simulate", "--cell", "pem") == ["pem_30w"]
 
 
 def test_bash_completes_protocols(bash_home: dict[str, str]) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.cli.main import main
 from tests.calibration.simulated_relaxation import relaxation
+from tests.command_line import run
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +32,11 @@ def test_existing_file_is_replaced_only_with_force(command, options, out_name, l
     out, used = tmp_path / out_name, tmp_path / "capture.csv"
     used.write_text("\n".join(capture.read_text().splitlines()[:lines]) + "\n")
     out.write_text("# measured in May\n")
-    arguments = [command, str(used), *options, "--out", str(out)]
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    assert ended.value.code == 2
-    assert f"error: --out {out}: exists already; --force replaces it" in capsys.readouterr().err
+    arguments = command, used, *options, "--out", out
+    code, _, err = run(capsys, *arguments)
+    assert (code, f"error: --out {out}: exists already; --force replaces it" in err) == (2, True)
     assert out.read_text() == "# measured in May\n"
-    with pytest.raises(SystemExit) as ended:
-        main([*arguments, "--force"])
-    assert not ended.value.code
+    assert run(capsys, *arguments, "--force")[0] == 0
     assert len(out.read_text().splitlines()) > 10
 
 
@@ -62,21 +58,16 @@ def test_duplicate_capture_is_rejected(command, make_duplicate, message, capture
     monkeypatch.chdir(tmp_path)
     again = tmp_path / "again.csv"
     make_duplicate(again, capture)
-    with pytest.raises(SystemExit) as ended:
-        main([command[0], str(capture), str(again), *command[1:]])
-    assert ended.value.code == 2
-    err = capsys.readouterr().err.replace(f"{tmp_path}/", "")
-    assert f"error: again.csv: {message}" in err
+    code, _, err = run(capsys, command[0], capture, again, *command[1:])
+    assert (code, f"error: again.csv: {message}" in err.replace(f"{tmp_path}/", "")) == (2, True)
     assert "the capture would count twice" in err
     assert not list(tmp_path.glob("mine*"))
 
 
 def test_missing_folder_is_an_error_before_the_computation(capture, tmp_path, capsys):
     out = tmp_path / "missing" / "report.html"
-    with pytest.raises(SystemExit) as ended:
-        main(["report", str(capture), "--cell", "ncr18650", "--out", str(out)])
-    assert ended.value.code == 2
-    assert f"there is no folder {out.parent}; create it" in capsys.readouterr().err
+    code, _, err = run(capsys, "report", capture, "--cell", "ncr18650", "--out", out)
+    assert (code, f"there is no folder {out.parent}; create it" in err) == (2, True)
 
 
 def test_full_disk_leaves_the_old_file(capture, full_disk, capsys, monkeypatch):
@@ -86,9 +77,7 @@ def test_full_disk_leaves_the_old_file(capture, full_disk, capsys, monkeypatch):
     (full_disk / "file").unlink()
     out.write_text("# measured in May\n")
     (full_disk / "file").write_bytes(b"")
-    with pytest.raises(SystemExit) as ended:
-        main(["ocv", str(capture), "--capacity-ah", "3", "--out", str(out), "--force"])
-    assert ended.value.code == 1
-    assert "cannot be written: No space left on device" in capsys.readouterr().err
+    code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "3", "--out", out, "--force")
+    assert (code, "cannot be written: No space left on device" in err) == (1, True)
     assert out.read_text() == "# measured in May\n"
     assert sorted(path.name for path in full_disk.iterdir()) == ["file", "mine.toml"]

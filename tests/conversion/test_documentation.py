@@ -12,6 +12,7 @@ from bms_estimator.model.cell import load_cell
 PAGE = (Path(__file__).parents[2] / "docs" / "cell" / "convert.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.thorough
 def test_the_examples_for_pybamm_and_pybop_print_the_documented_voltage(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pybop", reason="PyBOP is not installed")
     (tmp_path / "mine.py").write_text(pybamm_module(load_cell("nmc", 5.0)))

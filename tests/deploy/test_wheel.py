@@ -99,6 +99,7 @@ def test_wheel_contains_firmware_unit_and_udev_rule(tmp_path):
     assert {f"bms_estimator/installation/files/{name}" for name in files} <= names
 
 
+@pytest.mark.thorough
 def test_demo_runs_from_the_wheel_without_the_checkout(environment, tmp_path):
     done = run(environment, tmp_path, "demo", "--seconds", "5", "--no-browser")
     assert done.returncode == 0, done.stderr

@@ -22,7 +22,7 @@ from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 WALL_S = 1.7e9
 """Wall clock at the start [s since 1970]."""
@@ -92,12 +92,6 @@ def url(engine: NatsCluster) -> str:
     return f"mqtt://127.0.0.1:{engine.mqtt_port}"
 
 
-async def until(condition) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - counters have no event
-            await asyncio.sleep(0.01)
-
-
 @pytest.mark.parametrize("cells", [False, True])
 async def test_cell_voltages_are_sent_with_setting_cells_only(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path, cells: bool
@@ -163,6 +157,7 @@ async def test_samples_keep_their_period_if_a_new_store_begins_later_than_the_wa
     assert third.samples["time_s"].tolist() == [*np.arange(60.0, 120.0)]
 
 
+@pytest.mark.thorough
 async def test_no_sample_is_lost_when_the_server_is_killed(tmp_path: Path) -> None:
     with running(tmp_path, partitions=4) as engine:
         async with Receiver(engine.url, "pack") as receiver:

@@ -20,7 +20,7 @@ from bms_estimator.edge.block_table import EDGE_TABLES, NS
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.store.database import Database
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 WALL_S = 1.7e9
 """Wall clock at the creation of the store [s since 1970]."""
@@ -43,12 +43,6 @@ async def open_store(path: Path, max_bytes: int = UNLIMITED_BYTES, wall_s: float
     store = BlockStore(database, "raw/pack", max_bytes, wall=lambda: wall_s, resend_s=0.0)
     async with database, store:
         yield store
-
-
-async def until(condition) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - counters have no event
-            await asyncio.sleep(0.002)
 
 
 async def write_blocks(store: BlockStore, *blocks: ReadyBlock) -> None:

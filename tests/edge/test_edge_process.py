@@ -20,7 +20,7 @@ from bms_estimator.telemetry.health import sample_counters
 from tests.command_line import PROGRAM, run, running_program
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 from tests.serial_line import Line
 
 
@@ -77,9 +77,7 @@ async def test_edge_sends_no_block_twice_after_a_kill_and_ends_cleanly_on_sigter
                 sys.executable, "-X", "importtime", PROGRAM, "edge", pack, stdout=asyncio.subprocess.DEVNULL, stderr=log
             ) as process:
                 # blocks of the first process may still arrive while the second process imports its modules
-                async with asyncio.timeout(LONG_S):
-                    while b"store of blocks" not in log_file.read_bytes()[first_log_size:]:  # noqa: ASYNC110 - another process writes the log
-                        await asyncio.sleep(0.02)
+                await until(lambda: b"store of blocks" in log_file.read_bytes()[first_log_size:])
                 await receiver.wait_for_samples(sum(block.samples.size for block in receiver.blocks) + 1)
                 process.send_signal(signal.SIGTERM)
                 assert await asyncio.wait_for(process.wait(), LONG_S) == 0

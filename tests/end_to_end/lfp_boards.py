@@ -7,10 +7,10 @@ from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
 from typing import Protocol
 
+from bms_estimator.process.tasks import end
 from bms_estimator.simulation.virtual_adc import BoardParts
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from tests.end_to_end.lfp_pack import LfpPack
-from tests.patience import end
 from tests.simavr_board import FIRMWARE, FirmwareBoard
 
 PARTS = BoardParts(divider=3.23, current_zero=0.503, bandgap_v=1.08)

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
@@ -33,6 +34,7 @@ def simulate_stack() -> list[Reading]:
     return [Reading(*map(float, row)) for row in zip(*columns, strict=True)]
 
 
+@pytest.mark.thorough
 async def test_a_fuel_cell_is_estimated_and_its_checkpoint_equals_a_replay_and_can_be_restored(
     tmp_path: Path, broker: Broker
 ) -> None:

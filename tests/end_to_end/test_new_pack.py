@@ -157,7 +157,7 @@ def begin_of_charge_s(states: list[dict[str, Any]], charger_a: float) -> float:
 @pytest.fixture(
     params=[
         pytest.param("python", marks=pytest.mark.timeout(1800)),
-        pytest.param("simavr", marks=[pytest.mark.thorough, pytest.mark.timeout(3600)]),
+        pytest.param("simavr", marks=pytest.mark.timeout(3600)),
     ]
 )
 def board_kind(request: pytest.FixtureRequest) -> str:
@@ -166,6 +166,7 @@ def board_kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
+@pytest.mark.thorough
 async def test_a_new_pack_is_calibrated_and_its_soc_is_within_the_band(
     board_kind: str, tmp_path: Path, broker: Broker
 ) -> None:

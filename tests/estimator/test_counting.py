@@ -105,7 +105,7 @@ def test_a_gain_error_of_the_current_sensor_is_learned_as_a_capacity() -> None:
     assert np.sqrt(np.mean(np.square(errors))) < MAX_RMS_CAPACITY_ERROR
 
 
-@pytest.mark.parametrize("temperature_c", [25.0, 0.0])
+@pytest.mark.parametrize("temperature_c", [25.0, pytest.param(0.0, marks=pytest.mark.thorough)])
 def test_an_offset_of_20_ma_is_identified_within_a_day(temperature_c: float) -> None:
     errors_over_std = []
     for seed in SEEDS:

@@ -18,7 +18,10 @@ FAULT_S = 3600.0, 7200.0
 CAPACITY_AH = 3.0
 FIRST_SOC = {"cell1_random_steps": 0.98, "cell5_hppc": 0.98}
 """Initial SOC of captures that start neither full nor empty."""
-CHANGING_LOADS = ["cell5_random_steps", "cell1_dst", "cell1_hppc"]
+CHANGING_LOADS = [
+    "cell5_random_steps",
+    *(pytest.param(name, marks=pytest.mark.thorough) for name in ("cell1_dst", "cell1_hppc")),
+]
 BLOCK_SAMPLES = 20
 """Number of samples between two evaluations of the diagnostics."""
 Fault = Callable[[SampleBlock, np.ndarray], None]
@@ -191,7 +194,7 @@ def test_an_implausible_offset_is_reported(captures: Path, name: str) -> None:
     assert np.abs(run.error[run.after(3600.0)]).max() < 0.03
 
 
-@pytest.mark.parametrize("name", ["cell5_random_steps", "cell1_dst"])
+@pytest.mark.parametrize("name", CHANGING_LOADS[:2])
 def test_a_capacity_20_percent_too_small_is_reported(captures: Path, name: str) -> None:
     smaller = TRUTH.cell.model_copy(update={"capacity_ah": 0.8 * TRUTH.cell.capacity_ah})
     run = Run(capture(captures, name), TRUTH.model_copy(update={"cell": smaller}))

@@ -116,7 +116,7 @@ def test_sample_period_is_exactly_10_ms(start: Start) -> None:
     assert [s.board_us for s in samples] == [10_000 * (i + 1) for i in range(1000)]
 
 
-@pytest.mark.parametrize(("rate_hz", "seconds"), [(100, 20), (1000, 6)])
+@pytest.mark.parametrize(("rate_hz", "seconds"), [pytest.param(100, 20, marks=pytest.mark.thorough), (1000, 6)])
 def test_board_clock_and_adc_trigger_do_not_drift_apart(start: Start, rate_hz: int, seconds: int) -> None:
     """A signal with a period of one second changes at the same conversion of each second only if no conversion is lost."""
     # 0.4 ms after the begin of a window, so that both levels are in it
@@ -152,7 +152,7 @@ def test_each_rate_has_its_exact_period_after_the_next_samples(start: Start, rat
     assert all((a.status ^ b.status) & BoardStatus.AUX_IS_NTC for a, b in itertools.pairwise(aux))
 
 
-@pytest.mark.parametrize("rate_hz", [1, 10])
+@pytest.mark.parametrize("rate_hz", [pytest.param(1, marks=pytest.mark.thorough), 10])
 def test_reference_has_low_noise_at_low_rates(start: Start, rate_hz: int) -> None:
     """The reference is averaged over seconds. At low rates these have few samples, each with many readings of the bandgap."""
     host, decoder = start(), FrameDecoder()
@@ -295,7 +295,7 @@ def test_implausible_value_is_rejected(start: Start, set_command: bytes, old_val
     assert (ack.result, ack.value) == (AckResult.BAD_VALUE, old_value)
 
 
-@pytest.mark.parametrize("rates_hz", [(801, 1000), (667, 999), (1, 900)])
+@pytest.mark.parametrize("rates_hz", [(801, 1000), (667, 999), pytest.param((1, 900), marks=pytest.mark.thorough)])
 def test_increase_of_the_rate_misses_no_timer_compare(start: Start, rates_hz: tuple[int, int]) -> None:
     """The simulator aborts at a missed compare, which would cost the chip 4 ms that its clock does not count."""
     host = start()

@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +16,7 @@ from bms_estimator.service import relay_hook
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
 from tests.collector import Collector
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 from tests.simavr_board import SimavrBoard, write_readings
 
 pytestmark = pytest.mark.usefixtures("firmware")
@@ -50,13 +49,6 @@ class PinMonitor:
             self.is_high = is_high
             self.samples = 1 if sample["status"] & SampleStatus.RESET else self.samples + 1
         self.resets = self._decoder.counters.resets
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition of the bytes that the board sends."""
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - bytes have no event
-            await asyncio.sleep(0.01)
 
 
 def raised(snapshot: Snapshot) -> dict[str, str]:

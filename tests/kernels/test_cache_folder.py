@@ -73,6 +73,7 @@ def test_a_kernel_runs_without_space_for_its_cache(full_disk: Path) -> None:
     assert "RuntimeWarning: compiled kernels are not stored: No space left on device" in warning
 
 
+@pytest.mark.thorough
 def test_a_kernel_runs_without_a_folder_for_its_cache(disk_without_files: Path) -> None:
     warning = run_crc16_with_cache_in(disk_without_files)
     assert "RuntimeWarning: compiled kernels are not stored: no folder can be written" in warning
@@ -176,7 +177,7 @@ def erase_machine_code(content: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("suffix", "damage"),
     [  # numba writes an index (nbi) and the compiled code (nbc)
-        ("nbi", truncate),
+        pytest.param("nbi", truncate, marks=pytest.mark.thorough),
         pytest.param("nbi", empty, marks=pytest.mark.thorough),
         pytest.param("nbc", truncate, marks=pytest.mark.thorough),
         pytest.param("nbc", empty, marks=pytest.mark.thorough),

@@ -19,7 +19,8 @@ from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.certificates import Authority, openssl
-from tests.sinks.sink_helpers import STATE_TOPIC, until
+from tests.patience import until
+from tests.sinks.sink_helpers import STATE_TOPIC
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 

@@ -14,7 +14,8 @@ from bms_estimator.mqtt.connection import ConnectOptions
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, running
-from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, until
+from tests.patience import until
+from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state
 
 STATE_COUNT = 400
 """Number of published states, with the numbers 0 to ``STATE_COUNT`` - 1."""

@@ -13,8 +13,8 @@ from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy, read_packet
-from tests.patience import LONG_S
-from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, state_numbers, until
+from tests.patience import LONG_S, until
+from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, state_numbers
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 SHORT_TIMEOUTS = Timeouts(connect_s=1.0, keepalive_s=1, acknowledge_s=1.0)

@@ -14,8 +14,8 @@ from bms_estimator.mqtt.topic_cache import DeviceMessage
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy
-from tests.patience import LONG_S
-from tests.sinks.sink_helpers import Sink, until
+from tests.patience import LONG_S, until
+from tests.sinks.sink_helpers import Sink
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 

@@ -531,6 +531,7 @@ async def test_page_is_stale_while_the_sensor_or_the_service_is_offline(
         await page_tab.until_status("live")
 
 
+@pytest.mark.thorough
 async def test_page_is_stale_after_a_kill_of_the_service_and_live_after_its_restart(
     browser: Browser, programs: RunningPrograms
 ) -> None:

@@ -43,7 +43,7 @@ async def search_and_choose(page: Page, path: str) -> None:
     await expect(page.get_by_text("26.40 V, 5.00 A, discharging")).to_be_visible()
 
 
-@pytest.mark.parametrize("size", [PHONE, DESKTOP], ids=["phone", "desktop"])
+@pytest.mark.parametrize("size", [PHONE, pytest.param(DESKTOP, marks=pytest.mark.thorough)], ids=["phone", "desktop"])
 async def test_page_leads_from_the_search_to_the_first_estimate(tmp_path: Path, size: dict[str, int]) -> None:
     file = tmp_path / "house.toml"
     bms = SimulatedBms("jk", lambda _: Reading(5.0, 26.4, 21.0), cells=8)

@@ -18,7 +18,7 @@ from bms_estimator.process import listener as listener_module
 from bms_estimator.process.listener import CONNECTIONS, Connections, Listener
 from bms_estimator.settings.page import PageSettings
 from tests.idle_connections import DESCRIPTORS, few_descriptors, hold_idle_connections
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 
 async def test_under_a_thousand_idle_connections_files_can_be_opened_and_an_authorized_client_is_answered(
@@ -128,9 +128,7 @@ async def test_failed_accepts_are_logged_once_a_minute(monkeypatch: pytest.Monke
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard_limit))
         try:
             await asyncio.get_running_loop().sock_connect(client, ("127.0.0.1", port))
-            async with asyncio.timeout(LONG_S):
-                while attempts < 10:  # noqa: ASYNC110 - a counter has no event
-                    await asyncio.sleep(0.01)
+            await until(lambda: attempts >= 10)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, limits)
     await listener.close()

@@ -17,10 +17,10 @@ from tests.patience import LONG_S
 def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Return the list that receives the log lines, with no level set by an earlier test."""
     monkeypatch.setattr(log_setup, "_levels", {})
-    lines: list[str] = []
+    lines, configuration = list[str](), structlog.get_config()
     configure_logs(lines)
     yield lines
-    structlog.reset_defaults()
+    structlog.configure(**configuration)
 
 
 def test_lowest_level_of_all_packs_applies_and_can_change(lines: list[str]) -> None:

@@ -91,6 +91,7 @@ async def test_long_tables_continue_on_the_next_page(browser, history_page):
     assert breaks == [[30, "auto"], [30, "auto"], [5, "avoid"]]
 
 
+@pytest.mark.thorough
 async def test_screenshots_of_the_documentation_are_made(browser, report, tmp_path):
     paths = await take_screenshots(browser, report, tmp_path)
     assert [path.name for path in paths] == ["report-desktop.png", "report-phone.png", "report-print.png"]

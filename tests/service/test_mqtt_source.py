@@ -11,6 +11,7 @@ import aiomqtt
 from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
+from bms_estimator.process.tasks import end
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.pack import Settings
@@ -20,7 +21,7 @@ from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.factory import open_line_source
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
-from tests.patience import LONG_S, end
+from tests.patience import LONG_S
 
 STATE_TOPIC, HEALTH_TOPIC, AVAILABILITY_TOPIC = "bms/pack/state", "bms/pack/health", "bms/pack/sensor/availability"
 ONLINE_MESSAGE = AVAILABILITY_TOPIC, b"online"

@@ -19,7 +19,7 @@ import pytest
 
 from bms_estimator.checkpoint.run_file import RunFile
 from bms_estimator.process.instance_lock import instance_lock
-from tests.command_line import PROGRAM, running_program
+from tests.command_line import PROGRAM, run, running_program
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.serial_line import Line
@@ -152,6 +152,7 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
     assert str(checkpoint) in {line.get("file") for line in lines}
 
 
+@pytest.mark.thorough
 async def test_a_full_disk_does_not_end_the_service(
     tmp_path: Path, line: Line, broker: Broker, full_disk: Path
 ) -> None:
@@ -189,6 +190,7 @@ def unread_pipe() -> Iterator[int]:
         os.close(write)
 
 
+@pytest.mark.thorough
 async def test_a_stopping_service_saves_its_checkpoint_although_its_broker_hangs(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:
@@ -209,6 +211,7 @@ async def test_a_stopping_service_saves_its_checkpoint_although_its_broker_hangs
     assert RunFile(checkpoint.parent, "pack", time.time).load().counters.total.crashes == 0
 
 
+@pytest.mark.thorough
 async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shutdown(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:
@@ -229,7 +232,7 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
 @pytest.mark.parametrize(
     "signal_number",
     [
-        signal.SIGHUP,
+        pytest.param(signal.SIGHUP, marks=pytest.mark.thorough),
         pytest.param(signal.SIGTERM, marks=pytest.mark.thorough),  # ends the service of most tests in this file
         signal.SIGINT,
     ],
@@ -263,55 +266,49 @@ def test_an_acknowledgement_by_signal_does_not_end_a_service_that_is_still_impor
     assert (process.returncode, process.stderr.count("missing.toml: cannot be read")) == (2, 1), process.stderr
 
 
-async def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_restarts_the_service(
-    tmp_path: Path, line: Line, broker: Broker, disk_without_files: Path
+def test_a_full_disk_at_the_start_gives_an_exit_code_after_which_systemd_restarts_the_service(
+    tmp_path: Path, line: Line, broker: Broker, disk_without_files: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = disk_without_files / "state"
-    async with service(pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{folder}"')) as process:
-        assert process.stderr
-        output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
-        assert await process.wait() == 1  # systemd does not restart the service after exit code 2
-    assert output == f"error: state.folder = {folder}: No space left on device\n"
+    code, _, err = run(capsys, "run", pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{folder}"'))
+    assert code == 1  # systemd does not restart the service after exit code 2
+    assert err == f"error: state.folder = {folder}: No space left on device\n"
 
 
-async def test_a_state_folder_that_cannot_be_created_yet_gives_exit_code_75(
-    tmp_path: Path, line: Line, broker: Broker
+def test_a_state_folder_that_cannot_be_created_yet_gives_exit_code_75(
+    tmp_path: Path, line: Line, broker: Broker, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mount").touch()
     folder = tmp_path / "mount" / "state"
     pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{folder}"')
-    for others in ((), (pack_file(tmp_path, Line(tmp_path / "other board"), broker, "other"),)):
-        async with service(pack, *others) as process:
-            assert process.stderr
-            output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
-            assert await process.wait() == os.EX_TEMPFAIL, "systemd does not restart the service after exit code 2"
-        assert f"state.folder = {folder}: Not a directory\n" in output
+    other = pack_file(tmp_path, Line(tmp_path / "other board"), broker, "other")
+    for packs in ((pack,), (pack, other)):
+        code, _, err = run(capsys, "run", *packs)
+        assert code == os.EX_TEMPFAIL, "systemd does not restart the service after exit code 2"
+        assert f"state.folder = {folder}: Not a directory\n" in err
 
 
-async def test_a_password_file_that_cannot_be_read_yet_gives_exit_code_75(
-    tmp_path: Path, line: Line, broker: Broker
+def test_a_password_file_that_cannot_be_read_yet_gives_exit_code_75(
+    tmp_path: Path, line: Line, broker: Broker, capsys: pytest.CaptureFixture[str]
 ) -> None:
     missing = tmp_path / "not mounted" / "password"
     pack = pack_file(tmp_path, line, broker, state=f'username = "meter"\npassword_file = "{missing}"')
-    async with service(pack) as process:
-        assert process.stderr
-        output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
-        assert await process.wait() == os.EX_TEMPFAIL
-    assert output.endswith(f"error: mqtt.password_file = {missing}: cannot be read: No such file or directory\n")
+    code, _, err = run(capsys, "run", pack)
+    assert code == os.EX_TEMPFAIL
+    assert err.endswith(f"error: mqtt.password_file = {missing}: cannot be read: No such file or directory\n")
 
 
-async def test_a_pack_that_another_process_serves_gives_exit_code_75(
-    tmp_path: Path, line: Line, broker: Broker, state_home: Path
+def test_a_pack_that_another_process_serves_gives_exit_code_75(
+    tmp_path: Path, line: Line, broker: Broker, state_home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (state_home / "bms-estimator").mkdir(parents=True)
     with instance_lock(state_home / "bms-estimator", "pack"):
-        async with service(pack_file(tmp_path, line, broker)) as process:
-            assert process.stderr
-            output = (await asyncio.wait_for(process.stderr.read(), LONG_S)).decode()
-            assert await process.wait() == os.EX_TEMPFAIL
-    assert output.endswith(f"error: pack: this pack is served already, by process {os.getpid()}\n")
+        code, _, err = run(capsys, "run", pack_file(tmp_path, line, broker))
+    assert code == os.EX_TEMPFAIL
+    assert err.endswith(f"error: pack: this pack is served already, by process {os.getpid()}\n")
 
 
+@pytest.mark.thorough
 async def test_an_occupied_address_for_prometheus_ends_no_pack(
     tmp_path: Path, line: Line, broker: Broker, state_home: Path
 ) -> None:

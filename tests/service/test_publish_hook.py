@@ -13,8 +13,9 @@ from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.telemetry.alarms.message import Change
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy
+from tests.patience import until
 from tests.service.test_alarm_hooks import CLEARED, RAISED, wait_for_health
-from tests.sinks.sink_helpers import STATE_TOPIC, Sink, numbered_state, until
+from tests.sinks.sink_helpers import STATE_TOPIC, Sink, numbered_state
 
 DENIED = "topic readwrite bms/#\ntopic read load/#\n"
 """Access list that denies the topic of the hook."""

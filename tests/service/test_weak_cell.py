@@ -22,8 +22,8 @@ from tests.collector import Collector
 from tests.pack_model.bank_cycles import ONE_C, cycle, new_bank
 from tests.scripted_source import ScriptedSource
 
-SERIES, STEP_S, BLOCK = 3, 5.0, 12
-WEAK_CYCLE, REPLACED_CYCLE, CYCLES = 4, 5, 6
+SERIES, STEP_S, BLOCK = 3, 5.0, 36
+WEAK_CYCLE, REPLACED_CYCLE, CYCLES = 3, 4, 5
 FIT_S = 12 * 3600.0
 
 

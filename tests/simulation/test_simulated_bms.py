@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.serial.serial_source import SerialSource
-from tests.patience import LONG_S
+from tests.patience import until
 
 CELLS = 16
 RESOLUTIONS = {"jbd": (0.01, 0.01, 0.1), "daly": (0.1, 0.1, 1.0), "jk": (0.01, 0.01, 1.0), "jk-pb": (0.001, 0.001, 0.1)}
@@ -66,13 +66,6 @@ class SampleRecord:
         """Wait until this number of further samples has arrived."""
         awaited_count = self.count + samples
         await until(lambda: self.count >= awaited_count)
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Wait until ``condition`` returns something true."""
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - the condition is the test's
-            await asyncio.sleep(0.01)
 
 
 @contextlib.asynccontextmanager

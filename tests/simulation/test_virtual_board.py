@@ -35,7 +35,7 @@ from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading, compute_window
 from bms_estimator.simulation.virtual_board import BoardFault, VirtualBoard
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 STEADY = Reading(current_a=2.5, voltage_v=22.2, temperature_c=25.0)
 DIVIDER = 6.1
@@ -250,9 +250,7 @@ async def test_samples_lost_because_the_host_does_not_read_are_marked_as_overrun
     with virtual:
         host = os.open(virtual.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         running = asyncio.create_task(virtual.run())
-        async with asyncio.timeout(LONG_S):
-            while virtual.samples < 2000:  # noqa: ASYNC110 - the board's own count
-                await asyncio.sleep(0.01)
+        await until(lambda: virtual.samples >= 2000)
         decoder = FrameDecoder()
         blocks = []
         try:

@@ -1,9 +1,8 @@
 """Helpers for tests of the MQTT sink: a sink with the counters of a service, and numbered states to publish."""
 
-import asyncio
 import itertools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Self
 
 from bms_estimator.model.payloads.snapshot import Snapshot
@@ -14,7 +13,6 @@ from bms_estimator.sinks.mqtt.requests import COMMANDS, RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import Listener
-from tests.patience import LONG_S
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 STATE_TOPIC = "bms/pack/state"
@@ -69,10 +67,3 @@ def assert_all_in_order(received: list[int], count: int) -> None:
     assert list(dict.fromkeys(received)) == list(range(count))
     for before, after in itertools.pairwise(received):
         assert before - WINDOW < after <= before + 1, f"{before}, then {after}"
-
-
-async def until(condition: Callable[[], Any]) -> None:
-    """Wait until the condition is true."""
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - counters have no event
-            await asyncio.sleep(0.01)

@@ -19,7 +19,7 @@ from bms_estimator.store.history import HistorySink
 from bms_estimator.store.history_reader import HistoryReader, PastEvent
 from bms_estimator.store.minute import Minute
 from tests.doctor.as_user import as_nobody
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 BEGIN_S = 1_700_000_040
@@ -184,9 +184,7 @@ async def test_rows_wait_in_memory_while_the_disk_fails(path):
         database._file._quarantine_symlink = leave_in_place  # type: ignore[method-assign]
         history.publish(snapshot_at(0.0))
         history.publish(snapshot_at(60.0))
-        async with asyncio.timeout(LONG_S):
-            while not database.reason:  # noqa: ASYNC110 - it has no event
-                await asyncio.sleep(0.01)
+        await until(lambda: database.reason)
         (path / "file").unlink()
         path.rmdir()
     assert [row.time_s for row in read_rows(path)] == [BEGIN_S, BEGIN_S + 60]
@@ -230,9 +228,8 @@ async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path, 
         for second in range(0, 190, 10):
             history.publish(snapshot_at(float(second)))
             # each ended minute is one transaction, and two of them report a failure
-            async with asyncio.timeout(LONG_S):
-                while database.remaining > max(2 - second // 60, 0):  # noqa: ASYNC110 - it has no event
-                    await asyncio.sleep(0.001)
+            remaining = max(2 - second // 60, 0)
+            await until(lambda remaining=remaining: database.remaining <= remaining)
     assert [(row.publications, row.seen_s) for row in read_rows(path)] == [(6, 50.0), (6, 60.0), (6, 60.0), (1, 10.0)]
     assert len(past_events(path)) == 2
 

@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from tests.mosquitto import Broker, Listener
-from tests.patience import LONG_S
+from tests.patience import until
 from tests.serial_line import Line
 from tests.service.test_process import pack_file, print_samples, service, stop_service
 
@@ -33,9 +33,7 @@ async def test_states_of_an_outage_survive_a_kill_and_arrive_before_newer_ones_i
     board = asyncio.create_task(print_samples(line))
     pack = pack_file(tmp_path, line, broker, state=f'[state]\nfolder = "{tmp_path}"\n')
     async with service(pack) as process:
-        async with asyncio.timeout(LONG_S):
-            while len(messages_on_disk(tmp_path / "pack.sqlite")) < 25:  # noqa: ASYNC110 - a file has no event
-                await asyncio.sleep(0.05)
+        await until(lambda: len(messages_on_disk(tmp_path / "pack.sqlite")) >= 25)
         process.kill()
     stored = messages_on_disk(tmp_path / "pack.sqlite")
     await asyncio.to_thread(broker.start)

@@ -17,7 +17,7 @@ from bms_estimator.store import outbox as outbox_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.store.outbox_queue import MAX_TAIL
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 
 def numbered_message(number: int) -> Message:
@@ -91,13 +91,6 @@ def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the path of a database, to which the outbox then writes every 10 ms."""
     monkeypatch.setattr(outbox_module, "FLUSH_S", 0.01)
     return tmp_path / "pack.sqlite"
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    """Wait until the condition is true."""
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - files have no event
-            await asyncio.sleep(0.01)
 
 
 def numbers_on_disk(path: Path) -> list[int]:

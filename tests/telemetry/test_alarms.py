@@ -208,6 +208,7 @@ def knee(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("knee") / "capture.bms", knee_lines())
 
 
+@pytest.mark.thorough
 async def test_collapse_risk_says_probability_and_time_left_and_does_not_depend_on_the_size_of_blocks(
     knee: Path,
 ) -> None:

@@ -29,7 +29,7 @@ from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFle
 from bms_estimator.fleet.worker.worker import CHECKPOINT_S
 from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.benchmarks.fleet.rig import Rig, cpu_s, create_streams, rig, rss_mib
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 SEED, DAY_S, PARTITIONS = 1, 86_400.0, 64
 """Seed of the simulated packs, seconds of a day, and number of partitions of the stream."""
@@ -105,7 +105,7 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     load_time_s = time.monotonic() - load_begin_s
     names = [fleet_rig.start_worker(checkpoint_s=CHECKPOINT_S) for _ in range(arguments.workers)]
     received = await _listen(fleet_rig, fleet)
-    await _wait_until(lambda: len(received.workers) == len(names))
+    await until(lambda: len(received.workers) == len(names))
     begin = datetime.fromtimestamp(begin_s, UTC).replace(tzinfo=None).isoformat()
     blocks = round(minutes * arguments.speed) + 1
     edges = fleet_rig.simulate(packs, seed=SEED, begin=f"{begin}", speed=arguments.speed, blocks=blocks)
@@ -187,12 +187,6 @@ async def _listen(fleet_rig: Rig, fleet: SimulatedFleet) -> ReceivedMessages:
         await nc.subscribe(subjects.published(name, "state"), cb=record_state)
     await nc.flush()
     return received
-
-
-async def _wait_until(condition: Any) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - messages arrive in callbacks
-            await asyncio.sleep(0.1)
 
 
 def _wire_bytes(fleet_rig: Rig) -> int:

@@ -31,7 +31,7 @@ from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.benchmarks.table import Row
 from tests.fleet.tenant import Tenant, heavy_block, mqtt_client, numbered, one_tenant
 from tests.fleet.workers import PACK_ROW, PERIOD_S, SAMPLES, Heartbeats, Process, block
-from tests.patience import LONG_S
+from tests.patience import until
 
 ATTACKER = "attacker"
 PACKS = [f"p{i}" for i in range(20)]
@@ -98,9 +98,7 @@ class Latencies:
 
     async def wait_for_all(self) -> None:
         """Wait until a state has arrived for every block."""
-        async with asyncio.timeout(LONG_S):
-            while self.published_s:  # noqa: ASYNC110 - states arrive in a callback
-                await asyncio.sleep(0.01)
+        await until(lambda: not self.published_s)
 
     def summarize(self) -> tuple[float, float, int]:
         """Return median [s], maximum [s] and number of the latencies, and delete them."""

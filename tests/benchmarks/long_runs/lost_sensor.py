@@ -19,7 +19,7 @@ import aiomqtt
 
 from tests.benchmarks.table import Row
 from tests.mosquitto import Broker, Listener
-from tests.patience import LONG_S
+from tests.patience import until
 
 CHARGE_A = -30.0
 """Current of the pack, a charge [A]."""
@@ -145,9 +145,7 @@ async def _publisher(broker: Broker, values: dict[str, object]) -> AsyncIterator
 
 
 async def _wait_for_lines(out: Path, lines: int) -> None:
-    async with asyncio.timeout(LONG_S):
-        while len(_lines(out)) < lines:  # noqa: ASYNC110 - a program has no event
-            await asyncio.sleep(0.01)
+    await until(lambda: len(_lines(out)) >= lines)
 
 
 def _lines(out: Path) -> list[str]:

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from tests.benchmarks.long_runs.endurance import process_bytes
 from tests.benchmarks.long_runs.lost_sensor import ALARM_OF_QUANTITY, lose_quantities
 from tests.mosquitto import Broker
@@ -13,6 +15,7 @@ def test_every_frame_of_ten_minutes_of_serial_bytes_reaches_the_estimator() -> N
     assert decoder.counters["frames_lost"] == decoder.counters["clock_jumps"] == 0
 
 
+@pytest.mark.thorough
 async def test_each_lost_quantity_raises_sensor_fault_and_runs_the_hook_of_the_alarm_that_needs_it(
     broker: Broker, tmp_path: Path
 ) -> None:

@@ -11,6 +11,8 @@ from tests.estimator.month.cases import Case
 from tests.estimator.month.packs import draw_pack
 from tests.fit_interval import fits_every
 
+pytestmark = pytest.mark.thorough
+
 CASES = (
     Case("LG M50", "full_nightly", days=3),
     Case("LG M50", "full_nightly", days=4, seed=2),

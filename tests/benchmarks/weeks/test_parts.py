@@ -18,6 +18,8 @@ from tests.estimator.month.sources import SOLAR
 from tests.estimator.month.uses import HOUR_S, SOLAR_STEP_S, Phase, Use
 from tests.fit_interval import fits_every
 
+pytestmark = pytest.mark.thorough
+
 CASE = Case("LFP", "everything", SOLAR, declared_ah=20.0, days=3)
 INTERVAL_S = 1.25 * DAY_S
 """Interval between two fits [s], so that the second fit has a history with merged rows."""

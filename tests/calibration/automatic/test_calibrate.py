@@ -132,7 +132,9 @@ def test_a_given_chemistry_that_the_measured_ocv_contradicts_is_warned_about(che
     assert any("the measured OCV fits" in each for each in calibration.warnings) == is_warned
 
 
-@pytest.mark.parametrize(("rated_ah", "is_warned"), [(33.0, True), (30.0, False)])
+@pytest.mark.parametrize(
+    ("rated_ah", "is_warned"), [(33.0, True), pytest.param(30.0, False, marks=pytest.mark.thorough)]
+)
 def test_a_rated_capacity_that_a_whole_discharge_contradicts_is_warned_about(data, rated_ah, is_warned) -> None:
     leaf = load_capture(data / "leaf" / "hppc_25c_from_full.csv.gz")
     warnings = calibrate([leaf], load_cell("lmo", rated_ah), name="mine").warnings
@@ -140,6 +142,7 @@ def test_a_rated_capacity_that_a_whole_discharge_contradicts_is_warned_about(dat
     assert warnings == ((expected,) if is_warned else ())
 
 
+@pytest.mark.thorough
 def test_a_gap_of_hours_after_a_sample_of_a_charge_carries_no_charge(captures) -> None:
     rows = captures["relaxation"].rows.copy()
     last = int(np.flatnonzero(np.diff(rows["current_a"]) > 0.0)[9])  # of a rest
@@ -202,6 +205,7 @@ def test_a_larger_charge_than_the_rated_capacity_is_a_lower_bound_unless_the_cel
     assert "a lower bound, because the capture does not run from full to empty" in estimate.origin
 
 
+@pytest.mark.thorough
 def test_the_soc_of_a_start_below_full_is_counted_from_its_voltage() -> None:
     rows = capture(schedule(rounds=30), soc=0.93)
     calibration = calibrate([Columns(rows, "later")], with_capacity(TRUTH, 3.0), name="mine")
@@ -218,6 +222,7 @@ def test_the_given_soc_is_that_of_the_captures_at_the_highest_first_voltage(capt
     assert second.start.soc < 0.97
 
 
+@pytest.mark.thorough
 def test_pulses_with_rests_of_less_than_a_minute_measure_no_ocv() -> None:
     pulses_a = np.r_[np.zeros(60), np.tile(np.r_[np.full(90, 0.5), np.zeros(50)], 220)]
     pulses = Columns(capture(pulses_a, soc=1.0), "pulses")
@@ -240,6 +245,7 @@ def test_a_first_rest_on_a_plateau_is_named_with_the_socs_that_it_allows() -> No
     assert identify([Columns(rows, "plateau")], cell, initial_soc=0.85).captures[0].initial_soc == 0.85
 
 
+@pytest.mark.thorough
 def test_a_start_on_a_plateau_without_a_contradiction_is_named_beside_the_result() -> None:
     cell = load_cell("lfp", 3.0)
     rows = Columns(

@@ -110,6 +110,7 @@ def growth_near_empty(ladder):
     return ohm[0] / np.interp(0.65, ladder.soc, ohm)
 
 
+@pytest.mark.thorough
 def test_without_data_near_empty_the_resistances_grow_partly_as_in_the_given_file(warm):
     end = int(np.argmax(np.cumsum(warm.rows["current_a"]) > 0.6 * 3600.0 * TRUTH.cell.capacity_ah))
     without_low_soc = Columns(warm.rows[:end], "above")
@@ -162,6 +163,7 @@ def test_rc_pairs_that_a_slow_capture_does_not_determine_have_small_positive_res
     assert 1.0 < sections["r_ts"].offset_ohm * sections["c_ts"].offset_farad < 30.0
 
 
+@pytest.mark.thorough
 def test_a_capture_is_held_back_from_its_score_if_another_has_a_similar_temperature(warm, cold):
     other = Columns(ladder_capture(steps(5), WARM_C + 3.0), "other")
     result = identify([warm, cold, other], wrong_start())
@@ -219,6 +221,7 @@ def test_a_wrong_ocv_is_corrected(warm):
     assert (np.diff(result.ocv_v) > 0.0).all()
 
 
+@pytest.mark.thorough
 def test_an_ocv_error_within_the_hysteresis_hardly_changes_the_curve(warm):
     """With a hysteresis of +-25 mV, an error of 8 mV in a discharge gives no information on the OCV after charge."""
     soc = np.linspace(0.0, 1.0, 101)
@@ -293,7 +296,7 @@ def with_mismatched_records(samples, rows, voltage_from):
     return np.insert(samples, rows, records)
 
 
-@pytest.mark.parametrize("voltage_from", ["before", "after"])
+@pytest.mark.parametrize("voltage_from", ["before", pytest.param("after", marks=pytest.mark.thorough)])
 def test_records_whose_voltage_is_of_the_other_side_of_a_step_are_not_used(from_warm, warm, voltage_from):
     changes = np.flatnonzero(np.diff(warm.rows["current_a"])) + 1
     result = identify([Columns(with_mismatched_records(warm.rows, changes, voltage_from), "cycler")], wrong_start())

@@ -47,6 +47,7 @@ def follow_instructions(test, pack):
     return np.concatenate(rows)
 
 
+@pytest.mark.thorough
 def test_the_long_test_measures_the_ocv_in_rests_down_to_the_cut_off() -> None:
     pack, test = LfpPack(0.9, charger_a=1.0), GuidedTest(LONG, LIMITS)
     samples = follow_instructions(test, pack)

@@ -2,7 +2,6 @@
 
 import io
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -31,17 +30,16 @@ def test_replay_reads_all_exports_alike(tmp_path: Path, capsys: pytest.CaptureFi
     assert final_socs == pytest.approx([final_socs[0]] * len(final_socs), abs=1e-9)
 
 
-def test_validate_reads_an_export_from_standard_input(tmp_path: Path) -> None:
-    command = "import sys; from bms_estimator.cli.main import main; main(sys.argv[1:])"
-    result = subprocess.run(
-        [sys.executable, "-c", command, "validate", "-", "--cell", "ncr18650", "--json"],
-        input=german(measure()).encode("latin-1"),
-        capture_output=True,
-        check=True,
-    )
-    assert json.loads(result.stdout)["samples"] > 0
-    assert result.stderr.startswith(
-        b'stdin: read as unknown program (text, separator semicolon, decimal comma): time "Zeit" in min'
+def test_validate_reads_an_export_from_standard_input(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = german(measure()).encode("latin-1")
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(table)))
+    code, out, err = run(capsys, "validate", "-", "--cell", "ncr18650", "--json")
+    assert code == 0, err
+    assert json.loads(out)["samples"] > 0
+    assert err.startswith(
+        'stdin: read as unknown program (text, separator semicolon, decimal comma): time "Zeit" in min'
     )
 
 

@@ -17,12 +17,13 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import capture_digest
+from bms_estimator.process.tasks import end
 from bms_estimator.simulation.simulated_pack import PackWithRelay
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, read_capture, read_header
 from bms_estimator.sources.captures.replay import load_capture
 from tests.command_line import PROGRAM, run, running_program
-from tests.patience import LONG_S, end
+from tests.patience import LONG_S
 
 LOAD_A = 3.0
 SLICE_S = 10.0
@@ -138,7 +139,7 @@ def pack(tmp_path):
     [
         ("rest", 1.0, False),
         pytest.param("discharge", 0.0, False, marks=pytest.mark.thorough),
-        ("discharge", 1.0, True),
+        pytest.param("discharge", 1.0, True, marks=pytest.mark.thorough),
     ],
 )
 async def test_after_a_kill_the_test_continues_unless_charge_may_be_missing(
@@ -180,6 +181,7 @@ async def test_a_signal_disconnects_the_load_and_ends_with_code_130(pack, tmp_pa
     assert "the same command continues" in err.decode()
 
 
+@pytest.mark.thorough
 async def test_a_port_that_another_program_reads_is_an_error(pack, tmp_path) -> None:
     async with calibration(tmp_path):
         await pack.advance(until=lambda: pack.is_loaded)
@@ -204,6 +206,7 @@ def test_one_capture_of_a_leaf_cell_gives_a_cell_file_with_a_verdict(capsys, dat
     assert "Validated on the last 30 %" in out.read_text()
 
 
+@pytest.mark.thorough
 def test_a_capture_of_a_pack_from_standard_input_is_scaled_to_one_cell(capsys, monkeypatch, data, tmp_path) -> None:
     rows = [line.split(",") for line in _text_of(data / "lgm50" / "rate_0p1c_25c.csv.gz").splitlines()]
     voltage = rows[0].index("voltage_v")
@@ -284,6 +287,7 @@ def test_series_and_temperature_reach_fit_validation_and_report(capsys, data, tm
     assert "temperatures other than 10 °C" in report.read_text(encoding="utf-8")
 
 
+@pytest.mark.thorough
 def test_the_soc_at_the_start_of_a_partial_discharge_is_asked_for_and_reaches_fit_and_report(capsys, tmp_path) -> None:
     cell, begin_soc = load_cell("nmc", 40.0), 0.8
     current_a = np.r_[np.zeros(30), np.full(round(begin_soc * 9.0 * 60.0), 40.0 / 9.0), np.zeros(30)]

@@ -91,6 +91,7 @@ def test_user_errors_end_with_code_2(tables, tmp_path, capsys):
     assert "is also an input" in err
 
 
+@pytest.mark.thorough
 def test_sign_of_the_current_is_an_option(tables, tmp_path, capsys):
     rows = np.loadtxt(tables / "steps7.csv", delimiter=",", skiprows=1) * [1, -1, 1]  # negates the current
     flipped = tmp_path / "flipped.csv"

@@ -7,7 +7,8 @@ import pytest
 
 from bms_estimator.cli.cell.load_switch import LoadSwitch, relay_program
 from bms_estimator.model.errors import UserError
-from tests.patience import LONG_S, end
+from bms_estimator.process.tasks import end
+from tests.patience import until
 
 
 def program(folder: Path, text: str) -> str:
@@ -21,12 +22,9 @@ async def test_the_program_is_called_with_each_change_and_at_the_end(tmp_path) -
     calls = tmp_path / "calls"
     switch = LoadSwitch(relay_program(program(tmp_path, f'echo "$1" >> {calls}')), repeat=False)
     running = asyncio.create_task(switch.run())
-    async with asyncio.timeout(LONG_S):
-        while not calls.exists():  # noqa: ASYNC110 - a file has no event
-            await asyncio.sleep(0.01)
-        switch.request(on=True)
-        while calls.read_text() != "off\non\n":  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
+    await until(calls.exists)
+    switch.request(on=True)
+    await until(lambda: calls.read_text() == "off\non\n")
     await end(running)
     await switch.release()
     assert calls.read_text() == "off\non\noff\n"
@@ -45,9 +43,7 @@ async def test_a_load_that_cannot_be_disconnected_is_an_error(tmp_path) -> None:
     await switch.release()  # it was never connected
     switch.request(on=True)
     running = asyncio.create_task(switch.run())
-    async with asyncio.timeout(LONG_S):
-        while switch.error:  # noqa: ASYNC110 - the switch has no event for a success
-            await asyncio.sleep(0.01)
+    await until(lambda: not switch.error)
     await end(running)
     with pytest.raises(UserError, match=r"could not be disconnected: .* off: exit code 1; disconnect it now"):
         await switch.release()

@@ -225,7 +225,7 @@ def test_kinds_of_captures_are_recognized_and_combined_to_one_curve(tmp_path, ca
         assert words in text + out.read_text()
 
 
-@pytest.mark.parametrize("direction", ["dis", "chg"])
+@pytest.mark.parametrize("direction", ["dis", pytest.param("chg", marks=pytest.mark.thorough)])
 def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, capsys, shared_data, direction):
     """On a plateau, the hysteresis corresponds to 0.1 of SOC or more, so the curve is shifted by the hysteresis of the generic
     cell."""

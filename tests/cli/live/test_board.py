@@ -8,20 +8,12 @@ import threading
 import pytest
 from serial.tools import list_ports
 
-from bms_estimator.cli.main import main
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import device_detection
+from tests.command_line import run
 from tests.patience import LONG_S
 from tests.serial_line import usb_port
-
-
-def run_board(capsys, *arguments):
-    """Run the command and return exit code, stdout and stderr."""
-    with pytest.raises(SystemExit) as exit_info:
-        main(["board", *arguments])
-    out, err = capsys.readouterr()
-    return exit_info.value.code or 0, out, err
 
 
 @contextlib.contextmanager
@@ -54,7 +46,7 @@ def short_timeouts(monkeypatch):
 @pytest.mark.usefixtures("long_timeouts")
 def test_command_shows_the_properties_of_the_board(capsys):
     with running_board(rate_hz=50, serial=0xC0FFEE, parts=BoardParts(supply_v=4.8)) as path:
-        code, out, err = run_board(capsys, path)
+        code, out, err = run(capsys, "board", path)
     assert (code, err) == (0, "")
     shown = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert (shown["firmware"], shown["serial"], shown["rate"]) == ("0.2.0", "00c0ffee", "50 Hz")
@@ -66,13 +58,13 @@ def test_command_shows_the_properties_of_the_board(capsys):
 @pytest.mark.usefixtures("long_timeouts")
 def test_given_voltage_at_aref_sets_the_bandgap_and_so_the_reference(capsys):
     with running_board(rate_hz=50) as path:
-        code, out, err = run_board(capsys, path, "--aref-v", "4.7", "--serial", "77")
+        code, out, err = run(capsys, "board", path, "--aref-v", "4.7", "--serial", "77")
         assert (code, err) == (0, "")
         bandgap, serial = out.splitlines()[-2:]
         assert bandgap.startswith("bandgap: was 1.1000 V, now ")
         assert float(bandgap.split()[-2]) == pytest.approx(1.1 * 4.7 / 5.0, rel=1e-3)
         assert serial == "serial: was 00000001, now 0000004d"
-        _, out, _ = run_board(capsys, path)
+        _, out, _ = run(capsys, "board", path)
     shown = dict(line.split(maxsplit=1) for line in out.splitlines())
     assert shown["serial"] == "0000004d"
     assert float(shown["reference"].split()[0]) == pytest.approx(4.7, rel=1e-3)
@@ -83,18 +75,18 @@ def test_given_voltage_at_aref_sets_the_bandgap_and_so_the_reference(capsys):
 def test_implausible_voltage_at_aref_is_rejected(capsys, monkeypatch, aref_v):
     monkeypatch.setattr(device_detection, "REFERENCE_SAMPLES", 10)
     with running_board() as path:
-        code, _, err = run_board(capsys, path, "--aref-v", aref_v, "--serial", "7")
+        code, _, err = run(capsys, "board", path, "--aref-v", aref_v, "--serial", "7")
         assert code == 2
         assert err.startswith(f"error: --aref-v {aref_v}: ")
         assert "between 1.0 and 1.2 V" in err
-        _, out, _ = run_board(capsys, path)
+        _, out, _ = run(capsys, "board", path)
     assert "bandgap    1.1000 V" in out
     assert "serial     00000001" in out
 
 
 @pytest.mark.parametrize("serial", ["0", "-1", "4294967296", "x"])
 def test_serial_number_out_of_range_is_rejected(capsys, serial):
-    code, out, err = run_board(capsys, "/dev/none", "--serial", serial)
+    code, out, err = run(capsys, "board", "/dev/none", "--serial", serial)
     assert (code, out) == (2, "")
     assert "--serial" in err
 
@@ -102,7 +94,7 @@ def test_serial_number_out_of_range_is_rejected(capsys, serial):
 @pytest.mark.usefixtures("long_timeouts")
 def test_text_board_rejects_commands(capsys):
     with running_board(mode="text") as path:
-        code, out, err = run_board(capsys, path, "--serial", "7")
+        code, out, err = run(capsys, "board", path, "--serial", "7")
     assert (code, out) == (2, "")
     assert err.startswith(f"error: {path}: the board prints text, not frames")
     assert err.endswith("it takes no commands\n")
@@ -113,7 +105,7 @@ def test_port_without_a_board_is_reported(capsys):
     master, slave = os.openpty()
     path = os.ttyname(slave)
     try:
-        assert run_board(capsys, path) == (2, "", f"error: {path}: silent\n")
+        assert run(capsys, "board", path) == (2, "", f"error: {path}: silent\n")
     finally:
         os.close(slave)
         os.close(master)
@@ -121,16 +113,16 @@ def test_port_without_a_board_is_reported(capsys):
 
 def test_missing_port_is_reported(capsys, tmp_path, monkeypatch):
     path = tmp_path / "none"
-    assert run_board(capsys, str(path)) == (2, "", f"error: {path}: it does not exist\n")
+    assert run(capsys, "board", str(path)) == (2, "", f"error: {path}: it does not exist\n")
     monkeypatch.setattr(list_ports, "comports", list)
-    assert run_board(capsys) == (2, "", "error: auto: no USB serial port is connected\n")
+    assert run(capsys, "board") == (2, "", "error: auto: no USB serial port is connected\n")
     monkeypatch.setattr(list_ports, "comports", lambda: [usb_port("/dev/a"), usb_port("/dev/b")])
-    assert run_board(capsys) == (2, "", "error: auto: 2 serial ports are connected; choose one: /dev/a, /dev/b\n")
+    assert run(capsys, "board") == (2, "", "error: auto: 2 serial ports are connected; choose one: /dev/a, /dev/b\n")
 
 
 def test_file_that_is_no_port_is_reported(capsys, tmp_path):
     path = tmp_path / "file"
     path.write_text("[pack]\n")
-    code, out, err = run_board(capsys, str(path))
+    code, out, err = run(capsys, "board", str(path))
     assert (code, out) == (2, "")
     assert err.startswith(f"error: {path}: it is not a serial port")

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import re
+import socket
 from datetime import datetime
 from types import SimpleNamespace
 
@@ -11,7 +12,7 @@ import aiohttp
 import aiomqtt
 import pytest
 
-from tests.command_line import PROGRAM, running_program
+from tests.command_line import PROGRAM, run, running_program
 from tests.free_port import free_port
 from tests.mosquitto import Listener
 from tests.patience import LONG_S
@@ -71,6 +72,7 @@ async def test_client_receives_states_from_start_to_offline():
     assert "Traceback" not in err
 
 
+@pytest.mark.thorough
 async def test_the_method_of_the_thesis_runs_alone_and_moves_its_parameters_to_the_limits_of_their_bounds():
     port = free_port()
     async with demo("--thesis", "--speed", 5, "--rate-hz", 20, "--port", port) as process:
@@ -114,11 +116,9 @@ async def test_estimate_follows_a_demo_that_runs_faster_than_the_wall_clock():
     assert state["lock"] is True
 
 
-async def test_occupied_port_is_reported():
-    server = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
-    port = server.sockets[0].getsockname()[1]
-    async with server, demo("--seconds", 1, "--port", port) as process:
-        async with asyncio.timeout(LONG_S):
-            _, err = await process.communicate()
-    assert process.returncode == 2
-    assert err.decode().splitlines()[-1].startswith(f"error: port {port}: taken by another program")
+def test_occupied_port_is_reported(capsys):
+    with socket.create_server(("127.0.0.1", 0)) as occupant:
+        port = occupant.getsockname()[1]
+        code, _, err = run(capsys, "demo", "--seconds", 1, "--port", port)
+    assert code == 2
+    assert err.splitlines()[-1].startswith(f"error: port {port}: taken by another program")

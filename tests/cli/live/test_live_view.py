@@ -53,6 +53,7 @@ def test_interrupted_demo_prints_a_summary_and_restores_the_terminal() -> None:
     assert "Traceback" not in terminal.output
 
 
+@pytest.mark.thorough
 async def test_service_with_a_blocked_terminal_publishes_and_ends_on_sigterm(
     tmp_path: Path, line: Line, broker: Broker
 ) -> None:

@@ -8,8 +8,7 @@ import subprocess
 import pytest
 from serial.tools import list_ports
 
-from bms_estimator.cli.main import main
-from tests.command_line import PROGRAM
+from tests.command_line import PROGRAM, run
 from tests.patience import LONG_S
 
 
@@ -21,11 +20,9 @@ def wide_terminal(monkeypatch):
 
 def run_ports(capsys, *arguments):
     """Run the command, which must not write to stderr. Return exit code and stdout."""
-    with pytest.raises(SystemExit) as ended:
-        main(["ports", *arguments])
-    out, err = capsys.readouterr()
+    code, out, err = run(capsys, "ports", *arguments)
     assert err == ""
-    return ended.value.code or 0, out
+    return code, out
 
 
 @contextlib.contextmanager

@@ -10,7 +10,6 @@ import time
 import numpy as np
 import pytest
 
-from bms_estimator.cli.main import main
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import MAGIC, read_capture, read_header
@@ -82,10 +81,8 @@ def has_a_second(path):
 
 def replay(capsys, path):
     """Replay a capture. Return exit code, summary and stderr."""
-    with pytest.raises(SystemExit) as ended:
-        main(["replay", str(path), "--cell", "chen_mora", "--json"])
-    out, err = capsys.readouterr()
-    return ended.value.code or 0, json.loads(out), err
+    code, out, err = run(capsys, "replay", path, "--cell", "chen_mora", "--json")
+    return code, json.loads(out), err
 
 
 def test_all_bytes_are_recorded_until_ctrl_c(line: Line, tmp_path, capsys):
@@ -150,19 +147,16 @@ def capture(board, tmp_path_factory):
     return out
 
 
-def test_recording_ends_after_the_duration(board, tmp_path):
-    with program("record", tmp_path / "short.bms", "--port", board, "--seconds", 0.1) as process:
-        _, err = process.communicate(timeout=LONG_S)
-    assert process.returncode == 0
+def test_recording_ends_after_the_duration(board, tmp_path, capsys):
+    code, _, err = run(capsys, "record", tmp_path / "short.bms", "--port", board, "--seconds", 0.1)
+    assert code == 0
     assert re.search(r" 0 lost, 0 CRC errors, 0 other faults\n$", err)
     assert complete_reads(tmp_path / "short.bms")
 
 
 def test_replayed_samples_have_the_period_of_the_board(capture, tmp_path, capsys):
     table = tmp_path / "one.csv"
-    with pytest.raises(SystemExit):
-        main(["replay", str(capture), "--cell", "chen_mora", "--out", str(table)])
-    capsys.readouterr()
+    assert run(capsys, "replay", capture, "--cell", "chen_mora", "--out", table)[0] == 0
     times = np.loadtxt(table, delimiter=",", skiprows=1, usecols=0)
     assert times.size == sample_count(capture)
     assert np.allclose(np.diff(times), 1 / 100, rtol=0.0, atol=1e-5)
@@ -201,6 +195,7 @@ def test_existing_file_is_not_overwritten(tmp_path, capsys):
     assert out.read_bytes() == b"kept"
 
 
+@pytest.mark.thorough
 def test_full_disk_ends_the_recording_and_the_file_is_readable(board, tmp_path, capsys):
     out = tmp_path / "full.bms"
     limit = ["bash", "-c", 'ulimit -f 4; exec "$0" "$@"']  # 4 KiB
@@ -219,6 +214,7 @@ def test_full_disk_ends_the_recording_and_the_file_is_readable(board, tmp_path, 
     assert (message in err) == (unread > 0)  # the limit may lie between two records
 
 
+@pytest.mark.thorough
 def test_missing_board_is_reported(tmp_path):
     with program("record", tmp_path / "none.bms", "--port", tmp_path / "none") as process:
         assert f"waiting for {tmp_path / 'none'}: it does not exist" in process.stderr.readline()

@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.cli.main import main
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import set_rate_command, set_relay_command
-from tests.command_line import PROGRAM
+from tests.command_line import PROGRAM, run
 from tests.patience import LONG_S
 
 RATE_HZ = 50
@@ -106,14 +105,12 @@ def test_a_board_measures_a_fuel_cell_under_a_constant_load():
 
 @pytest.mark.parametrize("option", [("--capacity-ah", "3"), ("--protocol", "jk"), ("--load", "relay")])
 def test_options_of_batteries_are_rejected_for_a_fuel_cell(option, capsys):
-    with pytest.raises(SystemExit, match=r"^2$"):
-        main(["simulate", "--cell", "pem_30w", *option])
-    assert (
-        "--cell pem_30w: a fuel cell is simulated on a board without relay; omit --capacity-ah"
-        in capsys.readouterr().err
-    )
+    code, _, err = run(capsys, "simulate", "--cell", "pem_30w", *option)
+    assert code == 2
+    assert "--cell pem_30w: a fuel cell is simulated on a board without relay; omit --capacity-ah" in err
 
 
+@pytest.mark.thorough
 def test_the_relay_of_the_board_connects_the_load():
     with simulate("--load", "relay", "--current-a", "0.5", "--noise-lsb", "0") as (_, path), open_line(path) as line:
         data = read(line, lambda data: decode(data)[0].size >= 10)
@@ -122,6 +119,7 @@ def test_the_relay_of_the_board_connects_the_load():
         read(line, lambda data: decode(data)[0]["current_a"][-1] == pytest.approx(0.5, abs=0.05), data)
 
 
+@pytest.mark.thorough
 def test_text_lines_have_the_format_of_a_sketch():
     with simulate("--text", "--current-a", "0.2", "--load", "constant") as (process, path):
         with open_line(path) as line:
@@ -132,13 +130,13 @@ def test_text_lines_have_the_format_of_a_sketch():
     assert np.mean([float(line.split(b",")[1]) for line in lines]) == pytest.approx(0.2, abs=0.05)
 
 
-def test_simulation_ends_after_the_simulated_duration():
-    with simulate("--seconds", "4", "--speed", "20", "--load", "constant", "--current-a", "0") as (process, _):
-        out, err = process.communicate(timeout=LONG_S)
-    assert (process.returncode, out) == (0, "")
+def test_simulation_ends_after_the_simulated_duration(capsys):
+    code, _, err = run(capsys, "simulate", "--seconds", 4, "--speed", 20, "--load", "constant", "--current-a", 0)
+    assert code == 0
     assert re.fullmatch(r"40[01] samples in 4\.0 s, SOC 90\.00%\n", err)
 
 
+@pytest.mark.thorough
 def test_default_load_of_a_battery_monitor_is_1c():
     arguments = ("--cell", "lfp", "--capacity-ah", "100", "--load", "constant")
     with simulate("--protocol", "vedirect", *arguments) as (_, path), open_line(path) as line:
@@ -164,8 +162,6 @@ def test_default_load_of_a_battery_monitor_is_1c():
     ],
 )
 def test_invalid_arguments_are_reported(arguments, capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["simulate", *arguments])
-    out, err = capsys.readouterr()
-    assert (ended.value.code, out) == (2, "")
+    code, out, err = run(capsys, "simulate", *arguments)
+    assert (code, out) == (2, "")
     assert arguments[-1] in err or arguments[0] in err

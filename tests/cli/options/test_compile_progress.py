@@ -17,7 +17,9 @@ from tests.patience import LONG_S
 from tests.pseudo_terminal import PseudoTerminal
 
 
-@pytest.mark.parametrize("command", [pytest.param("demo", marks=pytest.mark.thorough), "replay", "run"])
+@pytest.mark.parametrize(
+    "command", [*(pytest.param(name, marks=pytest.mark.thorough) for name in ("demo", "replay")), "run"]
+)
 def test_first_start_reports_the_compilation_and_can_be_interrupted(command: str, tmp_path: Path) -> None:
     pack, table = tmp_path / "pack.toml", tmp_path / "table.csv"
     pack.write_text('[sensor]\nport = "/dev/none"\n')

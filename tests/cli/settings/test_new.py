@@ -120,6 +120,7 @@ def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
     assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
 
 
+@pytest.mark.thorough
 def test_an_interrupt_at_a_prompt_ends_with_code_130_and_writes_nothing(file):
     with running_device(jk_bms()) as path, PseudoTerminal("new", str(file), "--search", path, columns=200) as terminal:
         terminal.until(lambda: "Number of the device" in plain(terminal.output))
@@ -261,6 +262,7 @@ async def wait_for_node(broker: Broker) -> None:
         await listener.wait("jk-bms/sensor/jk-bms_temperature_sensor_1/state")
 
 
+@pytest.mark.thorough
 def test_a_publisher_at_the_broker_is_found_with_its_values(broker, file):
     simulated = [PROGRAM, "simulate", "--mqtt", broker.url, "--cell", "lfp", "--capacity-ah", "100", "--series", "16"]
     answers = options(series=None, parallel=None, broker=None)

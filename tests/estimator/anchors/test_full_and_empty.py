@@ -63,7 +63,7 @@ def test_the_ends_of_charge_keep_the_soc_of_a_generic_cell_right() -> None:
     assert np.mean(np.abs(error) < 2.0 * trace["soc_std"][after_first_day]) > 0.95
 
 
-@pytest.mark.parametrize("status", [0, SampleStatus.GAP])
+@pytest.mark.parametrize("status", [pytest.param(0, marks=pytest.mark.thorough), SampleStatus.GAP])
 def test_sparse_samples_in_the_constant_voltage_phase_have_an_anchor(status: int) -> None:
     """A cycler that writes a row at each change of the voltage writes one in some minutes, and one at the end of the charge."""
     samples, _ = days_with_a_charge()

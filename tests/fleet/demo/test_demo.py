@@ -2,6 +2,8 @@
 
 import subprocess
 
+import pytest
+
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
@@ -9,6 +11,7 @@ MAX_WIDTH = 100
 """Maximum length of a line of the output [characters]."""
 
 
+@pytest.mark.thorough
 def test_demo_names_faulty_packs_and_loses_no_block_when_a_worker_is_killed() -> None:
     arguments = ["--packs", "20", "--seconds", "3", "--no-browser"]
     command = [PROGRAM, "fleet", "demo", *arguments]

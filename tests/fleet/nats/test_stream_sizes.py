@@ -37,6 +37,7 @@ from tests.fleet.nats_cluster import running
 PACKS = 2
 
 
+@pytest.mark.thorough
 async def test_stored_day_of_a_pack_is_at_most_as_large_as_computed(tmp_path: Path) -> None:
     begin_s = time.time() // 3600 * 3600 - 2 * 86_400
     fleet, table = SimulatedFleet(PACKS, seed=1, begin_ns=int(begin_s) * 10**9), tmp_path / "packs.csv"

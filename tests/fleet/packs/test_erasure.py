@@ -82,6 +82,7 @@ async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_p
         assert files_with(tmp_path, subjects.hours("p1")) == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("has_worker", [True, False], ids=["with a worker", "without a worker"])
 async def test_pack_that_is_added_again_after_its_erasure_begins_anew(tmp_path, capsys, has_worker):
     with running(tmp_path, partitions=1) as cluster:

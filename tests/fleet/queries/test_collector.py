@@ -24,7 +24,7 @@ from bms_estimator.model.errors import UserError
 from tests.command_line import PROGRAM
 from tests.fleet.hour_rows import make_hour
 from tests.fleet.nats_cluster import running
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 MIDNIGHT = 490_000 // 24 * 24
 """Hour of a midnight [hours since 1970]."""
@@ -58,12 +58,6 @@ def rows_of(folder: Path):
     with duckdb.connect() as database:
         files = [str(file) for day in folder.glob("date=*") for file in complete_files(day)]
         return database.read_parquet(files).fetchall() if files else []
-
-
-async def until(condition):
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - files and other processes send no notification
-            await asyncio.sleep(0.02)
 
 
 @contextlib.asynccontextmanager

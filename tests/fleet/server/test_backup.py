@@ -19,10 +19,11 @@ from bms_estimator.fleet.nats.stream_snapshot import read_info
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.server.backup import BACKUP_ORDER, back_up, restore
 from bms_estimator.fleet.worker.checkpoint.claims import Claims
+from bms_estimator.process.tasks import end
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.workers import Heartbeats, Process, block, end_states, load_packs, record_of_run, samples, send, until
-from tests.patience import LONG_S, end
+from tests.patience import LONG_S
 
 PARTITIONS = 2
 PACKS = ["p0", "p1", "p2"]
@@ -45,6 +46,7 @@ async def numbers(nc: Client, pack: str) -> list[int]:
         return [decode(message.data).number async for batch in batches for message in batch]
 
 
+@pytest.mark.thorough
 async def test_worker_continues_after_a_restoration_as_if_only_blocks_that_no_edge_has_were_missing(
     tmp_path: Path,
 ) -> None:

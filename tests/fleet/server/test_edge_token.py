@@ -182,6 +182,7 @@ async def test_blocks_with_too_many_samples_are_rejected_and_other_packs_are_not
     await reader.close()
 
 
+@pytest.mark.thorough
 async def test_flood_of_blocks_delays_only_its_own_pack(fleet: Tenant) -> None:
     admin, reader = await fleet.program(Role.ADMIN), await fleet.program(Role.READER)
     registry = await load_packs(admin, ["p1", "attacker"])

@@ -172,6 +172,7 @@ def test_every_query_of_the_dashboard_has_a_result(fleet: Fleet, prometheus: Pro
             prometheus.wait(target["expr"].replace("$tenant", ".*").replace("$__rate_interval", "1m"))
 
 
+@pytest.mark.thorough
 def test_alert_fires_when_the_worker_is_killed_and_its_pack_sends(fleet: Fleet, prometheus: Prometheus) -> None:
     alert = 'ALERTS{alertname="FleetPartitionsWithoutWorker", alertstate="firing"}'
     dead_letters = 'ALERTS{alertname="FleetPacksNeedRepair", alertstate="firing", stream="DEAD"}'

@@ -8,7 +8,7 @@ import signal
 import socket
 import ssl
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,7 @@ from tests.command_line import run
 from tests.fleet.serve_process import ServeProcess
 from tests.free_port import free_port
 from tests.mqtt.certificates import Authority
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 
 
 @pytest.fixture(scope="module")
@@ -186,12 +186,6 @@ async def test_nats_server_ends_when_fleet_serve_is_killed(tmp_path: Path) -> No
 def is_listening(port: int) -> bool:
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - another process sends no notification
-            await asyncio.sleep(0.02)
 
 
 async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_answer_at_first(

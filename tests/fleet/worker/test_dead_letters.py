@@ -1,16 +1,19 @@
 """Blocks that no worker can process: ones that kill their worker, and ones of a later version."""
 
+import asyncio
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters, replay_letter
 from bms_estimator.fleet.worker.block_result import LETHAL
-from tests.command_line import PROGRAM, running_program
+from bms_estimator.fleet.worker.worker import Options, work
+from tests.command_line import PROGRAM, run, running_program
 from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.worker import later_blocks, lethal_block
 from tests.fleet.worker.later_blocks import later_block
@@ -40,6 +43,7 @@ def lethal(pack: str, number: int) -> bytes:
     return encode(Block(store_created_ns=STORE_ID_NS, number=number, oldest=1, arrival_s=1.79e9, samples=rows))
 
 
+@pytest.mark.thorough
 async def test_block_that_kills_its_workers_is_skipped_and_stored_as_a_dead_letter(
     nc, cluster, heartbeats, tmp_path
 ) -> None:
@@ -66,6 +70,7 @@ async def test_block_that_kills_its_workers_is_skipped_and_stored_as_a_dead_lett
     assert partition.state("p1")["estimator"].tobytes() == estimator.record.tobytes()
 
 
+@pytest.mark.thorough
 async def test_blocks_of_a_later_version_are_processed_by_a_replay_after_the_upgrade_of_the_workers(
     nc, cluster, heartbeats, tmp_path
 ) -> None:
@@ -94,6 +99,26 @@ async def test_blocks_of_a_later_version_are_processed_by_a_replay_after_the_upg
     assert await read_dead_letters(nc) == []
     partition = (await end_states(nc, registry, 1))[0]
     assert partition.state("p1")["estimator"].tobytes() == estimated(registry, "p1", 2)
+
+
+async def test_block_that_cannot_be_decoded_is_stored_as_a_dead_letter_and_can_be_replayed(
+    nc, cluster, heartbeats, capsys
+) -> None:
+    await load_packs(nc, ["p1"])
+    await send(nc, "p1", b"damaged")
+    stop = asyncio.Event()
+    working = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+    await heartbeats.until(lambda last: "w" in last and last["w"].dead_letters == 1)
+    stop.set()
+    await working
+    (letter,) = await read_dead_letters(nc)
+    assert (letter.pack, letter.data, letter.worker) == ("p1", b"damaged", "w")
+    command = run, capsys, "fleet", "dead-letters"
+    code, out, _ = await asyncio.to_thread(*command, "list", "--server", cluster.url)
+    assert (code, letter.reason in out) == (0, True)
+    code, out, _ = await asyncio.to_thread(*command, "replay", "p1", "--server", cluster.url)
+    assert (code, out) == (0, "replayed 1 block of 1 pack: p1\n")
+    assert await read_dead_letters(nc) == []
 
 
 async def test_replay_keeps_the_dead_letter_that_a_worker_stores_of_the_replayed_block(nc) -> None:

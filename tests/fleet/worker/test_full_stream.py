@@ -40,6 +40,7 @@ CHECKPOINT_S = 1
 """Checkpoint interval of the workers [s]."""
 
 
+@pytest.mark.thorough
 async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker_and_the_last_checkpoint_is_damaged(
     tmp_path: Path,
 ) -> None:

@@ -17,10 +17,9 @@ from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.table_in_force import PackLookup
 from bms_estimator.fleet.worker.worker import Options, work
-from bms_estimator.process.tasks import until_first_ends
+from bms_estimator.process.tasks import end, until_first_ends
 from tests.fleet.nats_cluster import running
 from tests.fleet.workers import Heartbeats, block, end_states, estimated, load_packs, send, until
-from tests.patience import end
 
 PARTITIONS = 4
 PACKS = ["p1", "p2", "p3"]

@@ -3,21 +3,19 @@
 import asyncio
 from pathlib import Path
 
-import nats
 import numpy as np
 import pytest
 from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.worker import Options, work
-from tests.fleet.nats_cluster import running
+from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.workers import PACK_ROW, PERIOD_S, Heartbeats, Process, block, end_states, load_packs, send
 
 CHANGED_ROW = encode_row(PackSpec(cell="ncr18650", period_s=PERIOD_S, capacity_ah=2.5))
@@ -130,77 +128,69 @@ def test_damaged_change_is_counted_and_skipped(damaged: bytes) -> None:
     assert (partition.sequence, partition.counters["damaged"]) == (1, 1)
 
 
-async def test_successor_of_a_killed_worker_applies_a_changed_row_between_the_same_blocks(tmp_path: Path) -> None:
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await nats.connect(cluster.url)
-        await make_streams(nc, partitions=1)
-        await load_packs(nc, ["p1"])
-        async with Heartbeats(nc) as heartbeats:
-            await send(nc, "p1", block("p1", 1))
-            first = Process(tmp_path, cluster.url, "first")
-            await heartbeats.until(lambda last: "first" in last and last["first"].blocks == 1)
-            assert await first.end() == 0  # its checkpoint includes block 1
-            second = Process(tmp_path, cluster.url, "second")
-            await send(nc, "p1", block("p1", 2))
-            await heartbeats.until(lambda last: "second" in last and last["second"].blocks == 1)
-            await write_bucket(nc, subjects.PACKS_BUCKET, {"p1": CHANGED_ROW})
-            await heartbeats.until(lambda last: last["second"].counters.get("table_changes") == 1)
-            await send(nc, "p1", block("p1", BLOCKS))
-            await heartbeats.until(lambda last: last["second"].blocks == BLOCKS - 1)
-            second.kill()
-            third = Process(tmp_path, cluster.url, "third")
-            await heartbeats.until(lambda last: "third" in last and last["third"].blocks == BLOCKS - 1)
-            assert await third.end() == 0
-        registry = registry_of(PACK_ROW)
-        reference = partition_of(registry)
-        for sequence in range(1, BLOCKS + 2):
-            reference.take("p1", await message_of(nc, sequence), sequence)
-        restored = (await end_states(nc, registry, 1))[0]
-        assert estimator_state(restored) == estimator_state(reference)
-        assert restored.counters["table_changes"] == 1
-        with pytest.raises(NotFoundError):  # no change was sent twice
-            await message_of(nc, BLOCKS + 2)
-        await nc.close()
+@pytest.mark.thorough
+async def test_successor_of_a_killed_worker_applies_a_changed_row_between_the_same_blocks(
+    nc: Client, cluster: NatsCluster, tmp_path: Path
+) -> None:
+    await load_packs(nc, ["p1"])
+    async with Heartbeats(nc) as heartbeats:
+        await send(nc, "p1", block("p1", 1))
+        first = Process(tmp_path, cluster.url, "first")
+        await heartbeats.until(lambda last: "first" in last and last["first"].blocks == 1)
+        assert await first.end() == 0  # its checkpoint includes block 1
+        second = Process(tmp_path, cluster.url, "second")
+        await send(nc, "p1", block("p1", 2))
+        await heartbeats.until(lambda last: "second" in last and last["second"].blocks == 1)
+        await write_bucket(nc, subjects.PACKS_BUCKET, {"p1": CHANGED_ROW})
+        await heartbeats.until(lambda last: last["second"].counters.get("table_changes") == 1)
+        await send(nc, "p1", block("p1", BLOCKS))
+        await heartbeats.until(lambda last: last["second"].blocks == BLOCKS - 1)
+        second.kill()
+        third = Process(tmp_path, cluster.url, "third")
+        await heartbeats.until(lambda last: "third" in last and last["third"].blocks == BLOCKS - 1)
+        assert await third.end() == 0
+    registry = registry_of(PACK_ROW)
+    reference = partition_of(registry)
+    for sequence in range(1, BLOCKS + 2):
+        reference.take("p1", await message_of(nc, sequence), sequence)
+    restored = (await end_states(nc, registry, 1))[0]
+    assert estimator_state(restored) == estimator_state(reference)
+    assert restored.counters["table_changes"] == 1
+    with pytest.raises(NotFoundError):  # no change was sent twice
+        await message_of(nc, BLOCKS + 2)
 
 
-async def test_change_that_an_edge_sends_as_a_block_has_no_effect(tmp_path: Path) -> None:
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await nats.connect(cluster.url)
-        await make_streams(nc, partitions=1)
-        await load_packs(nc, ["p1"])
-        stop = asyncio.Event()
-        async with Heartbeats(nc) as heartbeats:
-            worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
-            await send(nc, "p1", block("p1", 1))
-            await send(nc, "p1", encode_change(PackSource(CHANGED_ROW.decode(), None)))
-            await heartbeats.until(lambda last: "w" in last and last["w"].counters.get("damaged") == 1)
-            assert "table_changes" not in heartbeats.last["w"].counters
-            stop.set()
-            await worker_task
-        await nc.close()
+async def test_change_that_an_edge_sends_as_a_block_has_no_effect(nc: Client, cluster: NatsCluster) -> None:
+    await load_packs(nc, ["p1"])
+    stop = asyncio.Event()
+    async with Heartbeats(nc) as heartbeats:
+        worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+        await send(nc, "p1", block("p1", 1))
+        await send(nc, "p1", encode_change(PackSource(CHANGED_ROW.decode(), None)))
+        await heartbeats.until(lambda last: "w" in last and last["w"].counters.get("damaged") == 1)
+        assert "table_changes" not in heartbeats.last["w"].counters
+        stop.set()
+        await worker_task
 
 
 async def test_change_that_the_table_has_withdrawn_before_it_was_applied_is_followed_by_the_present_row(
-    tmp_path: Path,
+    nc: Client,
+    cluster: NatsCluster,
 ) -> None:
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await nats.connect(cluster.url)
-        await make_streams(nc, partitions=1)
-        await load_packs(nc, ["p1"])
-        stop = asyncio.Event()
-        async with Heartbeats(nc) as heartbeats:
-            worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
-            await send(nc, "p1", block("p1", 1))
-            await heartbeats.until(lambda last: "w" in last and last["w"].blocks == 1)
-            # as sent by a worker while the table had this row, and then deferred or read by the next owner
-            change = encode_change(PackSource(CHANGED_ROW.decode(), None))
-            await nc.jetstream().publish(subjects.table_change("p1"), change)
-            await heartbeats.until(lambda last: last["w"].counters.get("table_changes") == 2)
-            stop.set()
-            await worker_task
-        restored = (await end_states(nc, registry_of(PACK_ROW), 1))[0]
-        assert restored.in_force.rows == {"p1": PackSource(PACK_ROW.decode(), None)}
-        await nc.close()
+    await load_packs(nc, ["p1"])
+    stop = asyncio.Event()
+    async with Heartbeats(nc) as heartbeats:
+        worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
+        await send(nc, "p1", block("p1", 1))
+        await heartbeats.until(lambda last: "w" in last and last["w"].blocks == 1)
+        # as sent by a worker while the table had this row, and then deferred or read by the next owner
+        change = encode_change(PackSource(CHANGED_ROW.decode(), None))
+        await nc.jetstream().publish(subjects.table_change("p1"), change)
+        await heartbeats.until(lambda last: last["w"].counters.get("table_changes") == 2)
+        stop.set()
+        await worker_task
+    restored = (await end_states(nc, registry_of(PACK_ROW), 1))[0]
+    assert restored.in_force.rows == {"p1": PackSource(PACK_ROW.decode(), None)}
 
 
 async def message_of(nc: Client, sequence: int) -> bytes:

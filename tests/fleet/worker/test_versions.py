@@ -107,6 +107,7 @@ async def assert_bit_identical(nc: Client, registry: PackRegistry, blocks: int) 
     return list(partitions.values())
 
 
+@pytest.mark.thorough
 async def test_states_survive_a_rolling_upgrade_and_a_roll_back_while_blocks_arrive(nc, heartbeats, workers) -> None:
     registry = await load_packs(nc, PACKS + IDLE_PACKS)
     old = workers.start("old")
@@ -137,6 +138,7 @@ async def test_states_survive_a_rolling_upgrade_and_a_roll_back_while_blocks_arr
     assert all(each.counters[UPGRADED] and each.counters[DOWNGRADED] for each in partitions)
 
 
+@pytest.mark.thorough
 async def test_worker_refuses_checkpoints_of_an_unreadable_format_until_the_right_version_takes_them(
     nc, heartbeats, workers, cluster, monkeypatch
 ) -> None:

@@ -255,6 +255,7 @@ def test_a13_to_a15_have_nearly_no_effect_in_the_schemes(law):
     assert 0.0 < np.abs(estimates_v[1] - estimates_v[0]).max() < 5e-5
 
 
+@pytest.mark.thorough
 def test_the_printed_mean_error_needs_the_largest_error_half_of_the_time(corrections):
     """Erratum 28, by hand: 0.8 f + 0.1 (1 - f) = 0.4744, with the fraction f of the time."""
     assert "at least 53 % of the time" in corrections["E28"]

@@ -18,7 +18,7 @@ from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink
 from bms_estimator.sinks.exports.line_protocol import lines
 from tests.influxdb import INFLUXD, InfluxDB
-from tests.sinks.sink_helpers import until
+from tests.patience import until
 from tests.sinks.snapshots import CELL_SNAPSHOT, SNAPSHOT_WITHOUT_SAMPLES, SOC_LOW_ALARM
 
 ALARM_TO_ESCAPE = SOC_LOW_ALARM.model_copy(update={"text": 'charge "it" soon, \\now\nor never'})

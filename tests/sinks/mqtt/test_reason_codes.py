@@ -21,8 +21,8 @@ from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy
-from tests.patience import LONG_S
-from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, state_numbers, until
+from tests.patience import LONG_S, until
+from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, state_numbers
 from tests.sinks.snapshots import CELL_SNAPSHOT, snapshot
 
 IMPLEMENTATION_ERROR, NOT_AUTHORIZED, QUOTA_EXCEEDED, INVALID_PAYLOAD_FORMAT = 131, 135, 151, 153

@@ -31,8 +31,8 @@ from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy
-from tests.patience import LONG_S
-from tests.sinks.sink_helpers import Sink, until
+from tests.patience import LONG_S, until
+from tests.sinks.sink_helpers import Sink
 from tests.sinks.snapshots import CELL_SNAPSHOT, snapshot
 
 MAX_QUEUED = 4

@@ -13,6 +13,8 @@ import pytest
 from bms_estimator import load_capture
 from tests.sources.captures.cycler_exports import EXPORTS, Export
 
+pytestmark = pytest.mark.thorough
+
 COLUMNS = {
     "time_s": "Time [s]",
     "current_a": "Current [A]",

@@ -17,7 +17,7 @@ from bms_estimator.settings.sources.can import CanSource
 from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.fieldbus.can import BUS_OFF_BIT, CanProducer
 from bms_estimator.sources.line_source import SourceUnavailableError
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 from tests.serial_line import Line
 
 PYLONTECH_FRAME = can.Message(arbitration_id=0x356, is_extended_id=False, data=bytes.fromhex("721485ffd700"))
@@ -81,9 +81,7 @@ async def test_bus_off_is_reported_until_the_next_valid_frame(channel: str, send
         # the virtual bus also filters error frames by identifier; this identifier includes the bit that means bus off
         assert PYLONTECH_FRAME.arbitration_id & BUS_OFF_BIT
         sender.send(can.Message(arbitration_id=0x356, is_extended_id=False, is_error_frame=True))
-        async with asyncio.timeout(LONG_S):
-            while producer.counters["error_frames"] == 0:  # noqa: ASYNC110 - it has no event for it
-                await asyncio.sleep(0.001)
+        await until(lambda: producer.counters["error_frames"] != 0)
         assert "bus off" in (producer.fault or "")
         sender.send(PYLONTECH_FRAME)
         await next_line(lines)

@@ -5,7 +5,7 @@ More tests of the check are in ``test_pinned_board``.
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,17 +19,11 @@ from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import port_list
 from bms_estimator.sources.serial.serial_source import SerialSource
-from tests.patience import LONG_S
+from tests.patience import until
 from tests.serial_line import Line, usb_port
 
 ASH_RESET = b"\x1a\xc1\x02\x0b\x0a\x52\x7e"
 """Bytes that a Zigbee stick sends after its reset."""
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - the condition is the test's
-            await asyncio.sleep(0.01)
 
 
 @contextlib.asynccontextmanager

@@ -3,23 +3,16 @@
 The other board scales the voltage differently and sends no hello by itself, because it is not reset.
 """
 
-import asyncio
-
 import numpy as np
 import pytest
 
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.framing import MAX_DOUBT_S
-from bms_estimator.protocols.firmware.messages import Hello, hello_command
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
-from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.board_check import MAX_PENDING_READS, BoardCheck, OtherBoardError
-from bms_estimator.sources.serial.serial_source import SerialSource
-from tests.serial_line import Line
-from tests.sources.serial.test_pinned_board import until
 
 PACK_V = 22.2
 PERIOD_S = 0.01
@@ -42,8 +35,7 @@ class RunningBoard:
 
     def hello(self) -> bytes:
         """Return the frame of the board's hello."""
-        hello: Hello = self._board._hello()
-        return hello.encode()
+        return self._board._hello().encode()
 
     def frames(self, count: int) -> list[bytes]:
         """Return the frames of the next ``count`` samples."""
@@ -114,41 +106,6 @@ def test_samples_that_do_not_continue_are_accepted_after_a_time_without_a_hello(
     block = feed_frames(new_decoder, BEGIN_S + 2.0, RunningBoard(OUR_SERIAL, OUR_DIVIDER, 50_000, 900.0).frames(1000))
     assert block["status"][0] & SampleStatus.GAP
     assert not block["status"][1:].any()
-
-
-async def test_other_board_on_the_open_port_is_rejected_after_its_hello(line: Line) -> None:
-    line.plug()
-    source = SerialSource(SensorSettings(port=str(line.path)), first_retry_s=0.05)
-    blocks: list[SampleBlock] = []
-    ours, other = RunningBoard(OUR_SERIAL, OUR_DIVIDER), RunningBoard(OTHER_SERIAL, OTHER_DIVIDER, 50_000, 900.0)
-
-    async def store_blocks() -> None:
-        async for block, *_ in source:
-            blocks.append(block)
-
-    async with source:
-        task = asyncio.create_task(store_blocks())
-        try:
-            await until(lambda: source.silence_reason and "no frame yet" in source.silence_reason)
-            line.write(ours.hello() + b"".join(ours.frames(10)))
-            await until(lambda: source._board_check.serial)
-            received = line.received()
-            line.write(b"".join(other.frames(10)))
-
-            def is_requested() -> bool:
-                nonlocal received
-                received += line.received()
-                return hello_command() in received
-
-            await until(is_requested)
-            line.write(other.hello() + b"".join(other.frames(10)))
-            await until(
-                lambda: source.silence_reason and "board 00000002 is not the pack's, 00000001" in source.silence_reason
-            )
-        finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-    assert np.concatenate(blocks)["voltage_v"] == pytest.approx(np.full(10, PACK_V), abs=0.1)
 
 
 def check_of_our_board() -> tuple[BoardCheck, BoardProtocol]:

@@ -7,7 +7,7 @@ import os
 import shutil
 import stat
 import tty
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,33 +17,22 @@ from pydantic import ValidationError
 from serial.tools import list_ports
 from structlog.testing import capture_logs
 
-from bms_estimator.model.cell import load_cell
-from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.firmware.messages import MessageType
-from bms_estimator.service.pack_service import run_pack_service
-from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import board_check, port_list, serial_source
 from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
-from tests.collector import Collector
 from tests.command_line import run
-from tests.patience import LONG_S
+from tests.patience import until
 from tests.serial_line import usb_port
 
 OURS_V, OTHERS_V = 22.2, 11.1
 """Voltages that the pack's board and another board measure [V]. By default they have serial numbers 1 and 2."""
 BOARD_42 = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
 """Stored fields of a board with serial number 42."""
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - the condition is the test's
-            await asyncio.sleep(0.01)
 
 
 @pytest.fixture
@@ -134,20 +123,6 @@ async def test_other_board_on_the_configured_port_is_rejected_after_a_restart(
         assert reader.blocks == []
 
 
-async def test_other_board_on_the_configured_port_is_rejected_until_the_own_board_is_back(port_folder: Path) -> None:
-    port = port_folder / "ttyUSB0"
-    async with source(port) as reader:
-        async with board(port):
-            await until(lambda: reader._board_check.serial)
-        await until(lambda: reader.silence_reason)
-        async with board(port, serial=2, voltage_v=OTHERS_V):
-            await until(lambda: reader.silence_reason and "refused" in reader.silence_reason)
-        blocks_before = len(reader.blocks)
-        async with board(port):
-            await until(lambda: len(reader.blocks) > blocks_before)
-    assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
-
-
 async def test_first_board_is_rejected_if_the_settings_name_another_serial_number(
     port_folder: Path, memory: KnownBoardFile
 ) -> None:
@@ -203,28 +178,6 @@ async def test_own_board_is_found_on_another_port_among_other_boards(port_folder
         async with board(port):  # back on the first port
             await until(lambda: len(reader.blocks) > blocks_before)
     assert np.concatenate(reader.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
-
-
-async def test_two_packs_find_their_boards_after_the_ports_were_swapped(port_folder: Path, tmp_path: Path) -> None:
-    first_port, second_port = port_folder / "ttyUSB0", port_folder / "ttyUSB1"
-    memories = [KnownBoardFile(tmp_path, name) for name in ("house", "shed")]
-    async with (
-        source(first_port, memories[0]),
-        source(second_port, memories[1]),
-        board(first_port, serial=1),
-        board(second_port, serial=2, voltage_v=OTHERS_V),
-    ):
-        await wait_until_stored(memories[0], "00000001")
-        await wait_until_stored(memories[1], "00000002")
-    async with (
-        source(first_port, memories[0]) as house,
-        source(second_port, memories[1]) as shed,
-        board(second_port, serial=1),
-        board(first_port, serial=2, voltage_v=OTHERS_V),
-    ):
-        await until(lambda: house.blocks and shed.blocks)
-    assert np.concatenate(house.blocks)["voltage_v"] == pytest.approx(OURS_V, abs=0.1)
-    assert np.concatenate(shed.blocks)["voltage_v"] == pytest.approx(OTHERS_V, abs=0.1)
 
 
 async def test_two_packs_find_their_boards_among_all_ports(port_folder: Path) -> None:
@@ -300,33 +253,6 @@ async def test_other_board_is_rejected_after_the_board_file_was_deleted_within_a
             reconnects_before = reader.counters["reconnects"]
             await until(lambda: reader.counters["reconnects"] > reconnects_before)
             assert "refused" in (reader.silence_reason or "")
-
-
-async def test_other_board_after_a_restart_is_reported_in_health(
-    port_folder: Path, tmp_path: Path, memory: KnownBoardFile
-) -> None:
-    port = port_folder / "ttyUSB0"
-    settings = Settings(
-        pack=PackSettings(name="house", cell="ncr18650", series=6), sensor=SensorSettings(port=str(port))
-    )
-
-    async def serve_until(condition: Callable[[Snapshot], bool]) -> Snapshot:
-        """Run the service of the pack until a snapshot fulfills the condition. Return this snapshot."""
-        stop, sink = asyncio.Event(), Collector()
-        cell = load_cell("ncr18650").pack(6, 1)
-        running = asyncio.create_task(run_pack_service(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
-        try:
-            return await sink.until(condition)
-        finally:
-            stop.set()
-            await running
-
-    async with board(port):
-        await serve_until(lambda s: s.health.samples["samples"] > 0 and bool(memory.load()))
-    async with board(port, serial=2, voltage_v=OTHERS_V):
-        snapshot = await serve_until(lambda s: "refused" in (s.health.sensor_message or ""))
-    assert "board 00000002 is not the pack's, 00000001" in (snapshot.health.sensor_message or "")
-    assert snapshot.health.samples["samples"] <= 1  # the sample of the checkpoint
 
 
 async def test_board_that_prints_text_is_accepted_although_another_board_is_stored(

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import termios
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import port_list
 from bms_estimator.sources.serial.device_detection import probe
 from bms_estimator.sources.serial.serial_source import SerialSource
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 from tests.serial_line import Line
 
 STEADY = Reading(current_a=0.5, voltage_v=22.2, temperature_c=25.0)
@@ -37,12 +37,6 @@ def text_source(line: Line, **options: Any) -> SerialSource:
     """Return a source that reads text from the line, with short retry and silence intervals."""
     settings = {"port": str(line.path), "protocol": "text", "baud": 115_200} | options.pop("settings", {})
     return SerialSource(SensorSettings(**settings), first_retry_s=0.05, silent_s=0.3, **options)
-
-
-async def until(condition: Callable[[], object]) -> None:
-    async with asyncio.timeout(LONG_S):
-        while not condition():  # noqa: ASYNC110 - the condition is the test's
-            await asyncio.sleep(0.01)
 
 
 async def take(source: SerialSource, min_samples: int) -> SampleBlock:
