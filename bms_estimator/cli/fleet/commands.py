@@ -39,9 +39,6 @@ COMMANDS = {
     "capture": LazyCommand(
         "bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a CSV or Parquet file."
     ),
-    "identify": LazyCommand(
-        "bms_estimator.cli.fleet.identify:identify", "Re-identify packs from their stored samples."
-    ),
     "collect": LazyCommand(
         "bms_estimator.cli.fleet.queries:collect", "Write hourly summaries of all packs to Parquet files."
     ),

@@ -26,8 +26,7 @@ from bms_estimator.settings.pack import DeviceName, PackSettings, PackValues, Se
 from bms_estimator.settings.sensor import GainStd, SensorSettings
 
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
-"""Pattern of a cell's name. It may be longer than a pack's name, because ``fleet identify`` names cell files after
-packs."""
+"""Pattern of a cell's name."""
 _SECTIONS: dict[str, type[Strict]] = {"pack": PackSettings, "sensor": SensorSettings, "identifier": IdentifierSettings}
 """Sections of a settings file whose values come from a specification."""
 

@@ -17,7 +17,7 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.sources.captures.replay import Replay, load_capture, open_capture
 from tests.command_line import run
-from tests.fleet.identification.test_block_capture import STORE_ID_NS, encoded_block, samples
+from tests.fleet.nats.test_block_capture import STORE_ID_NS, encoded_block, samples
 from tests.fleet.nats_cluster import running
 from tests.fleet.worker.test_single_cells import MODEL, SETTINGS, minutes, table
 from tests.patience import LONG_S
