@@ -16,7 +16,7 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
-from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
+from bms_estimator.pack_model.learning import FIT_INTERVAL_S, SlowFit, Submit, run_now
 from bms_estimator.settings.pack import Settings
 
 
@@ -139,7 +139,8 @@ def new_pack(
     estimator = new_estimator(settings, model)
     slow_fit = None
     if estimator.identifying and settings.identifier.pack_model:
-        slow_fit = SlowFit(estimator, submit=submit, on_failure=on_failure)
+        interval_s = settings.identifier.fit_interval_s or FIT_INTERVAL_S
+        slow_fit = SlowFit(estimator, submit=submit, interval_s=interval_s, on_failure=on_failure)
     forecaster = make_forecaster(settings, model, estimator)
     return Pack(estimator, slow_fit, CellEstimator(estimator), forecaster, has_forecasts=has_forecasts)
 

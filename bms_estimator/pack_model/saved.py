@@ -64,7 +64,7 @@ _ROW_RANGES = {
     "reference_kind": (0.0, 2.0),
 }
 """Range of each field of a row that is always finite."""
-_SHAPES = {
+FIT_SHAPES = {
     "elapsed_s": (),
     "segment": (),
     "charge_as": (),
@@ -103,7 +103,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 def curve_arrays(fit: PackFit | None) -> dict[str, NDArray[Any]]:
     """Return the curves and results of a fit by name; empty without a fit."""
-    return {} if fit is None else {name: np.array(getattr(fit, name)) for name in _SHAPES}
+    return {} if fit is None else {name: np.array(getattr(fit, name)) for name in FIT_SHAPES}
 
 
 def fit_of_curves(arrays: Arrays) -> PackFit | None:
@@ -115,7 +115,7 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
     if not arrays:
         return None
     values: dict[str, Any] = {}
-    for name, shape in _SHAPES.items():
+    for name, shape in FIT_SHAPES.items():
         value = _fit_field(arrays, name)
         if value.shape != shape:
             raise ValueError(f"{name} of the fit is damaged")
@@ -148,7 +148,7 @@ def _is_within(values: NDArray[Any], limits: tuple[float, float]) -> bool:
 
 def neutral_fit() -> PackFit:
     """Return a fit that corrects nothing. The service adopts it before the first sample to compile the code."""
-    values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in _SHAPES.items()}
+    values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in FIT_SHAPES.items()}
     values |= {"covariance": np.eye(_RESULTS), "hysteresis": 1.0}
     none = np.zeros(0)
     return PackFit(**values, row_elapsed_s=none, row_soc=none, curves=())
@@ -180,7 +180,7 @@ def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
 
 def _first_discharges(arrays: Arrays) -> ReferenceDischarges | None:
     """Return the first discharges of a bank; None if none were saved."""
-    fit = fit_of_curves({name: arrays[BANK + name] for name in _SHAPES if BANK + name in arrays})
+    fit = fit_of_curves({name: arrays[BANK + name] for name in FIT_SHAPES if BANK + name in arrays})
     return None if fit is None else ReferenceDischarges(checked_rows(arrays.get("bank_rows")), fit)
 
 
@@ -216,7 +216,7 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
         ValueError: A field is missing, or has another layout or an implausible value.
     """
     history = History(checked_rows(arrays.get("rows")), _weak_cell_times(arrays), _first_discharges(arrays))
-    fit = fit_of_curves({name: value for name, value in arrays.items() if name in _SHAPES})
+    fit = fit_of_curves({name: value for name, value in arrays.items() if name in FIT_SHAPES})
     if fit is None:
         return history, None
     elapsed_s, soc, curves = (_fit_field(arrays, name) for name in ("row_elapsed_s", "row_soc", "curves"))

@@ -26,6 +26,7 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoi
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.command_line import PROGRAM
+from tests.fleet.partition_stream import estimates_of
 from tests.patience import LONG_S
 
 PERIOD_S = 10.0
@@ -206,4 +207,4 @@ def record_of_run(registry: PackRegistry, pack: str, rows: SampleBlock) -> bytes
     assert cell
     estimator = make_estimator(settings, cell)
     estimator.run(rows)
-    return estimator.record.tobytes()
+    return estimates_of(estimator.record)

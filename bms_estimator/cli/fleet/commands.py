@@ -17,6 +17,9 @@ COMMANDS = {
     "worker": LazyCommand(
         "bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."
     ),
+    "fit": LazyCommand(
+        "bms_estimator.cli.fleet.fit:fit", "Fit the models of packs to their histories, once a day for each pack."
+    ),
     "ingest": LazyCommand(
         "bms_estimator.cli.fleet.ingest:ingest", "Receive batches of samples from a telemetry platform."
     ),

@@ -20,6 +20,7 @@ from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, BlockResult
 from bms_estimator.fleet.worker.cpu_budget import CpuBudget
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage
+from bms_estimator.fleet.worker.raw_messages import is_block
 from bms_estimator.fleet.worker.replay_guard import ReplayGuard
 from bms_estimator.fleet.worker.result_publisher import ResultPublisher
 from bms_estimator.fleet.worker.table_change_sender import TableChangeSender
@@ -142,7 +143,7 @@ class BlockRunner:
             result = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR)
         self.budget.charge(pack, time.thread_time() - begin_s)
         self.faults += result.failed
-        self._results.queue_summaries(result)
+        self._results.queue_stored(result)
         if result.dead_reason:
             self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
         if is_change(data):  # the table may have changed again since this change was sent
@@ -150,8 +151,8 @@ class BlockRunner:
         return result
 
     def count_block(self, data: bytes) -> None:
-        """Count a block and its samples, and update the lag. Changes of the table are not counted."""
-        if is_change(data):
+        """Count a block and its samples, and update the lag. Other messages are not counted."""
+        if not is_block(data):
             return
         samples, arrival_s = peek_header(data)
         self.blocks += 1

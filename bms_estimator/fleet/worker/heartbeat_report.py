@@ -83,7 +83,7 @@ class HeartbeatReport:
             clock_error_count=len(clock_errors),
             clock_errors=dict(nlargest(MAX_LISTED, clock_errors.items(), key=lambda each: abs(each[1]))),
             waiting=sum(len(lease.consumer.waiting) for lease in leases),
-            hours_waiting=sum(len(lease.results.waiting_summaries) for lease in leases),
+            hours_waiting=sum(len(lease.results.waiting) for lease in leases),
             unsaved_s=self._unsaved_s(owned_leases),
             checkpoint_s=checkpoint_s,
             cpu_s=usage.ru_utime + usage.ru_stime,

@@ -14,6 +14,7 @@ import structlog
 from numpy.typing import NDArray
 
 from bms_estimator.edge.block import Block, BlockError, BlockHeader, decode, decode_header
+from bms_estimator.fleet.fits.messages import decode_result, is_fit
 from bms_estimator.fleet.packs.pack_type import PackType
 from bms_estimator.fleet.packs.table_change import is_change
 from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken, position
@@ -170,8 +171,10 @@ class Partition:
             return self._apply_change(pack, data)
         pack_type = self.in_force.look_up(pack)
         if pack_type is None:
-            is_block = isinstance(self._decode(data), Block)
+            is_block = not is_fit(data) and isinstance(self._decode(data), Block)
             return self.defer(pack, sequence) if is_block else BlockResult(pack)
+        if is_fit(data):
+            return self._receive_fit(pack, data, sequence, pack_type)
         return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def defer(self, pack: str, sequence: int) -> BlockResult:
@@ -194,6 +197,8 @@ class Partition:
         self.deferred.advance(pack, sequence)
         if is_change(data):
             return self._apply_change(pack, data)
+        if is_fit(data):
+            return self._receive_fit(pack, data, sequence, pack_type)
         return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def reject_misplaced(self, pack: str, sequence: int) -> BlockResult:
@@ -212,6 +217,22 @@ class Partition:
             self._counters["damaged"] += 1
         else:
             self._counters["table_changes"] += 1
+        return BlockResult(pack)
+
+    def _receive_fit(self, pack: str, data: bytes, sequence: int, pack_type: PackType) -> BlockResult:
+        """Store the result of a fit in the record of its pack, if the pack has requested it."""
+        records = self._records
+        try:
+            result = decode_result(data)
+        except ValueError:
+            self._counters["damaged"] += 1
+            return BlockResult(pack)
+        if records.is_current(pack) and records.load(pack) is None:
+            if self._processor.receive_fit(result, sequence, pack_type):
+                self._unsaved.add(pack, position(records.unpacked.delivery))
+                records.store(pack)
+            else:
+                self._counters["stale_fits"] += 1
         return BlockResult(pack)
 
     def _decode_and_take(
@@ -325,8 +346,7 @@ class Partition:
     ) -> BlockResult | None:
         """Estimate the next block; None after an internal error."""
         try:
-            state, parameters, cells, hours = self._processor.step(pack, block, arrival, pack_type, unmigrated_fields)
-            return BlockResult(pack, state=state, parameters=parameters, cells=cells, hours=hours)
+            return self._processor.step(pack, block, arrival, pack_type, unmigrated_fields)
         except Exception:  # an internal error with one block must not stop the pack
             log.exception("a block is skipped", partition=self.number, pack=pack, number=block.number)
         self._processor.reset_window()

@@ -34,10 +34,10 @@ async def open_stores(nc: Client, worker: str) -> TenantStores:
     """
     partitions = await require_partitions(nc)
     try:
-        await nc.jetstream().stream_info(subjects.DEAD_STREAM)
+        await nc.jetstream().stream_info(subjects.FITS_STREAM)
     except NotFoundError:
         raise UserError(
-            f"the server has no stream {subjects.DEAD_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
+            f"the server has no stream {subjects.FITS_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
         ) from None
     checkpoints = await open_checkpoints(nc, worker)
     bucket = PackBucket(nc)

@@ -6,9 +6,8 @@ An earlier version reads such a record by the names of its fields, and drops the
 import json
 from functools import lru_cache
 
-from bms_estimator.fleet.worker.cell_summary import MAX_CELLS
 from bms_estimator.fleet.worker.checkpoint.record_layout import layout_of
-from bms_estimator.fleet.worker.pack_state import CELLS, pack_dtype
+from bms_estimator.fleet.worker.pack_state import CELLS, MAX_CELLS, pack_dtype
 
 
 @lru_cache(maxsize=MAX_CELLS)
