@@ -20,7 +20,13 @@ from tests.patience import LONG_S
 
 BLOCKS = 8
 """Number of blocks of each pack, which last 80 minutes."""
-STREAMS = (subjects.RAW_STREAM, subjects.HOURS_STREAM, f"OBJ_{subjects.STATES_BUCKET}")
+STREAMS = (
+    subjects.RAW_STREAM,
+    subjects.HOURS_STREAM,
+    subjects.HISTORY_STREAM,
+    subjects.FITS_STREAM,
+    f"OBJ_{subjects.STATES_BUCKET}",
+)
 
 
 def block(pack, number):

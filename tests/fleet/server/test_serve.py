@@ -26,9 +26,9 @@ from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_server import serve as serve_node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
-from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.nats_server_program import find_server
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from tests.command_line import run
 from tests.fleet.serve_process import ServeProcess
