@@ -17,9 +17,8 @@ from bms_estimator.fleet.fits.messages import FitResult
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
 from bms_estimator.fleet.worker import hour_summary
+from bms_estimator.fleet.worker.block_checks import MAX_TIMESTAMP_S, Arrival, clock_error_s
 from bms_estimator.fleet.worker.block_result import BlockResult
-from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
-from bms_estimator.fleet.worker.edge_clock import Arrival, clock_error_s
 from bms_estimator.fleet.worker.pack_fits import PackFits
 from bms_estimator.fleet.worker.pack_state import (
     CONFIG_DIGEST,

@@ -17,18 +17,23 @@ from bms_estimator.edge.block import Block, BlockError, BlockHeader, decode, dec
 from bms_estimator.fleet.fits.messages import decode_result, is_fit
 from bms_estimator.fleet.packs.pack_type import PackType
 from bms_estimator.fleet.packs.table_change import is_change
-from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken, position
+from bms_estimator.fleet.worker.block_checks import Arrival, density_fault
+from bms_estimator.fleet.worker.block_order import (
+    BlockOrder,
+    UnsavedPositions,
+    classify_block,
+    edge_reply,
+    mark_taken,
+    position,
+)
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, LETHAL, BlockResult
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
-from bms_estimator.fleet.worker.density import density_fault
-from bms_estimator.fleet.worker.edge_clock import Arrival
 from bms_estimator.fleet.worker.pack_records import PackRecords
 from bms_estimator.fleet.worker.pack_state import Fields
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources, TableInForce
-from bms_estimator.fleet.worker.unsaved_positions import UnsavedPositions
 from bms_estimator.kernels.cells.records import CELL
 
 log = structlog.get_logger(__name__)
@@ -49,7 +54,7 @@ class Partition:
         sequence: Stream sequence number of the last processed or deferred message; 0: none.
         in_force: Table of packs that is in force at this position of the stream.
         deferred: Queue of packs with deferred messages.
-        clock_errors: Errors of edges' clocks beyond the limits of ``edge_clock``, by pack [s], positive if ahead. A pack is
+        clock_errors: Errors of edges' clocks beyond the limits of ``block_checks``, by pack [s], positive if ahead. A pack is
             listed from a block with an error until the end of this hour on its clock.
     """
 

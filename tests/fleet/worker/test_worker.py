@@ -29,7 +29,7 @@ from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.simulation.block_publisher import run_edges
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
-from bms_estimator.fleet.worker.membership import assign_partitions
+from bms_estimator.fleet.worker.heartbeats import assign_partitions
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, connected, running

@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S, require_partiti
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
-from bms_estimator.fleet.worker.checkpoint.fenced_change import change_checkpoints
+from bms_estimator.fleet.worker.checkpoint.claims import change_checkpoints
 from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError, UnreadableFormatError
 from bms_estimator.model.errors import UserError
 
