@@ -83,7 +83,7 @@ class _IdentifierSwitches(Strict):
     pack_model: bool = Field(
         default=True,
         repr=False,  # not part of the digest of a fleet's settings
-        description="a fit to the pack's history of weeks, each hour, gives its own OCV curve, capacity and resistances; false: these are the cell file's with the corrections that the filter learns",
+        description="a fit to the pack's history of weeks gives its own OCV curve, capacity and resistances; false: these are the cell file's with the corrections that the filter learns",
     )
 
 

@@ -25,7 +25,7 @@ from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 
 MAX_TYPES = 256
-"""Maximum number of cached types of 40 kB each. Creating a type that is not cached takes 50 ms."""
+"""Maximum number of cached types. Creating a type that is not cached takes 50 ms."""
 Bytes = NDArray[np.uint8]
 Digest = tuple[int, int]
 """First 128 bits of a SHA-256 digest as two words."""
@@ -95,8 +95,8 @@ def config_digest(settings: Settings, cell: PackModel) -> Digest:
 
 
 def bytes_of(settings: np.void) -> Bytes:
-    """Return a copy of a record as bytes, whose copy takes a hundredth of the time of a copy by fields."""
-    return np.array([settings]).view(np.uint8)
+    """Return a view of a record as bytes, whose copy takes a hundredth of the time of a copy by fields."""
+    return np.frombuffer(settings, np.uint8)
 
 
 def state_digest(settings: Settings, cell: PackModel) -> Digest:

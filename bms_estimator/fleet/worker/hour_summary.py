@@ -158,7 +158,7 @@ def _filter_values(estimator: Estimator) -> dict[str, object]:
     capacity, offset, r_s = (
         relative_capacity(record),
         current_offset(record),
-        relative_series_resistance(record, settings),
+        relative_series_resistance(record, settings, estimator.cell_file_settings),
     )
     values: dict[str, object] = {
         "soc_std": float(weakest_cell_soc_std(f, settings["filter"])),

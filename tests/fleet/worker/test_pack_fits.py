@@ -6,6 +6,7 @@ import pytest
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import FitRequest, decode_result
 from bms_estimator.fleet.fits.pack_history import FitJob, run_job
+from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
@@ -17,7 +18,9 @@ from tests.estimator.simulated_cell import measured, wrong_cell
 from tests.fleet.partition_stream import STORE_ID_NS, Stream, blocks_of
 
 PACK, HOURS, PERIOD_S = "a", 10, 10.0
-CELL: CellModel = wrong_cell(1.5)
+FACTOR = 1.5
+"""Factor on the resistances of the cell file."""
+CELL = wrong_cell(FACTOR)
 SETTINGS = Settings(
     pack=PackSettings(cell="ncr18650"), identifier=IdentifierSettings(fit_interval_s=5400.0, soc_std=0.1)
 )
@@ -44,9 +47,11 @@ class FittedStream(Stream):
         super().__init__(Partition(0, table))
         self.history: dict[str, bytes] = {}
         self.requests: list[FitRequest] = []
+        self.hours: list[Hour] = []
 
     def send(self, pack: str, data: bytes, *, defer: bool = False):
         result = super().send(pack, data, defer=defer)
+        self.hours += [Hour.model_validate_json(row) for _, row in result.hours]
         for message in result.history:
             if message.subject == subjects.history(pack):
                 self.history.setdefault(message.message_id, message.data)  # the server drops repetitions
@@ -91,6 +96,7 @@ def test_worker_that_is_killed_after_each_message_agrees_with_a_replay_bit_for_b
     assert pack.slow_fit.fits >= 2
     assert stream.partition.counters["fits"] == pack.slow_fit.fits
     assert "late_fits" not in stream.partition.counters
+    assert stream.hours[-1].r_s_ratio == pytest.approx(1.0 / FACTOR, rel=0.15)
     assert record_of(stream).tobytes() == pack.estimator.record.tobytes()
 
 
