@@ -138,6 +138,23 @@ class Process:
         self._process.wait(LONG_S)
 
 
+class Fitter:
+    """Process ``fleet fit``, which starts at once and logs to a file."""
+
+    def __init__(self, folder: Path, url: str) -> None:
+        with (folder / "fit.log").open("a") as log:
+            self._process = subprocess.Popen([str(PROGRAM), "fleet", "fit", "--server", url], stderr=log)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(LONG_S)
+
+    def end(self) -> int:
+        """Send SIGTERM and return the exit code."""
+        self._process.terminate()
+        return self._process.wait(LONG_S)
+
+
 class Heartbeats:
     """Subscriber to heartbeats. ``last`` is the last heartbeat of each worker."""
 

@@ -1,7 +1,6 @@
 """``fleet fit`` on a real server, with a worker that is killed."""
 
 import asyncio
-import subprocess
 from collections.abc import Iterator
 from contextlib import aclosing
 from pathlib import Path
@@ -17,9 +16,8 @@ from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.worker.partition import Partition
-from tests.command_line import PROGRAM
 from tests.fleet.nats_cluster import NatsCluster, connected, running
-from tests.fleet.workers import Heartbeats, Process, block, end_states, send
+from tests.fleet.workers import Fitter, Heartbeats, Process, block, end_states, send
 from tests.patience import LONG_S
 
 PACK = "p1"
@@ -34,11 +32,10 @@ def cluster(tmp_path: Path) -> Iterator[NatsCluster]:
 
 
 @pytest.fixture
-def fitter(cluster: NatsCluster) -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen([*map(str, (PROGRAM, "fleet", "fit", "--server", cluster.url))])
+def fitter(cluster: NatsCluster, tmp_path: Path) -> Iterator[Fitter]:
+    process = Fitter(tmp_path, cluster.url)
     yield process
-    process.terminate()
-    assert process.wait(LONG_S) == 0
+    assert process.end() == 0
 
 
 async def stored(nc: Client, stream: str, subject: str) -> list[StoredMessage]:
