@@ -9,9 +9,9 @@ import tempfile
 from pathlib import Path
 from typing import Self
 
-from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us
+from bms_estimator.process.nats_server_program import find_server
 
 MQTT_PORT = 1883
 """Default port of MQTT clients."""

@@ -4,7 +4,11 @@
 ``raw.<pack>``               blocks of an edge (module ``block``), received by the stream ``RAW``
 ``table.<pack>``             changes of a row of the table of packs, received by the stream ``RAW``
 ``p.<partition>.raw.<pack>`` these blocks as the stream ``RAW`` stores them; publishing to this subject has no effect.
-                             Changes of the table are stored as ``p.<partition>.table.<pack>``
+                             Changes of the table are stored as ``p.<partition>.table.<pack>``, and fits as
+                             ``p.<partition>.fit.<pack>``
+``fit.<pack>``               result of a fit of the pack's model, received by the stream ``RAW``
+``history.<pack>``           rows of a pack's history, or all rows with the last fit, stored in the stream ``HISTORY``
+``fits.<pack>``              request for a fit by a worker, stored in the stream ``FITS`` until it is answered
 ``edge.<pack>.awaits``       ``BlockRequest`` to the edge: the first block that no saved checkpoint includes
 ``bms.<pack>.<topic>``       estimates, in the format of the command ``run``
 ``dead.<pack>.<digest>``     a block that a worker could not process, stored in the stream ``DEAD``
@@ -22,6 +26,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 RAW_STREAM, HOURS_STREAM, DEAD_STREAM, TELEMETRY_STREAM = "RAW", "HOURS", "DEAD", "TELEMETRY"
+HISTORY_STREAM, FITS_STREAM = "HISTORY", "FITS"
 PACKS_BUCKET, CELLS_BUCKET, CHECKPOINTS_BUCKET, STATES_BUCKET = "packs", "cells", "checkpoints", "states"
 """Names of buckets. The first three are key-value buckets: settings by pack, cell files by name, and the last checkpoint
 by partition. The fourth is an object bucket with the content of the checkpoints."""
@@ -57,13 +62,28 @@ def stored_raw(partition: int, pack: str = "*") -> str:
 
 
 def stored(partition: int, pack: str = "*") -> str:
-    """Return the subject of a pack's blocks and changes of the table in the stream ``RAW``."""
+    """Return the subject of a pack's blocks, changes of the table and fits in the stream ``RAW``."""
     return f"p.{partition}.*.{pack}"
 
 
-def is_table_change(stored_subject: str) -> bool:
-    """Return True if the stream ``RAW`` stores changes of the table under a subject."""
-    return stored_subject.split(".")[2] == "table"
+def is_raw(stored_subject: str) -> bool:
+    """Return True if the stream ``RAW`` stores messages of edges under a subject."""
+    return stored_subject.split(".")[2] == "raw"
+
+
+def fit(pack: str = "*") -> str:
+    """Return the subject of the results of fits of a pack's model."""
+    return f"fit.{pack}"
+
+
+def history(pack: str = "*") -> str:
+    """Return the subject of the rows of a pack's history."""
+    return f"history.{pack}"
+
+
+def fit_request(pack: str = "*") -> str:
+    """Return the subject of requests for fits."""
+    return f"fits.{pack}"
 
 
 def mapping(partitions: int) -> tuple[str, str]:

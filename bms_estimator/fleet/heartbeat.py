@@ -64,13 +64,13 @@ class Heartbeat(BaseModel):
     unknown: tuple[str, ...] = ()
     """Names of some unknown packs."""
     clock_error_count: int = 0
-    """Number of packs whose edge's clock is wrong (``worker.edge_clock``)."""
+    """Number of packs whose edge's clock is wrong (``worker.block_checks``)."""
     clock_errors: dict[str, float] = Field(default_factory=dict)
     """Errors of some of these clocks by pack [s], the largest ones; positive if ahead."""
     waiting: int = 0
     """Number of messages that were received from the server and not processed yet."""
     hours_waiting: int = 0
-    """Number of summaries that the server has not acknowledged yet."""
+    """Number of summaries and messages of histories that the server has not acknowledged yet."""
     unsaved_s: float = 0.0
     """Largest time for which a partition has had blocks that its last checkpoint does not include [s]."""
     checkpoint_s: float | None = None

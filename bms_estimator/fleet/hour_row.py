@@ -84,31 +84,18 @@ class Hour(Payload):
     delta_1: float | None = Field(description="SOC below which C_ts is negative, (2.11) of the thesis")
     delta_2: float | None = Field(description="SOC below which C_tl is negative, (2.12) of the thesis")
     suspects: int = Field(description="bits of model.input_faults.InputFault")
-    cell_spread_v: float | None = Field(
-        default=None,
-        description="mean difference between the highest and the lowest series cell [V]; null without cell voltages",
-    )
     weakest_cell: int | None = Field(
         default=None,
-        description="number of the series cell with the lowest mean voltage, from 1; null without cell voltages",
-    )
-    weakest_cell_v: float | None = Field(
-        default=None,
-        description="mean deviation of the weakest cell from the mean of the cells [V]; null without cell voltages",
-    )
-    cells_rest_v: list[float] | None = Field(
-        default=None,
-        description="mean deviation of each series cell from the mean of the cells while the pack rests [V]; null without "
-        "cell voltages or without a rest",
+        description="number of the series cell with the lowest SOC, from 1; null before an estimate of the single cells, as are the "
+        "following six",
     )
     weakest_cell_soc_deviation: float | None = Field(
-        default=None,
-        description="SOC of weakest_cell less the mean SOC of the cells; null before an estimate of the single cells, as are the "
-        "following three",
+        default=None, description="SOC of weakest_cell less the mean SOC of the cells"
     )
     weakest_cell_resistance_ratio: float | None = Field(
         default=None, description="resistance of weakest_cell relative to the median of the cells"
     )
+    cell_soc_spread: float | None = Field(default=None, description="highest less lowest SOC of the cells")
     self_discharge_cell: int | None = Field(
         default=None, description="number of the series cell with the most significant self-discharge, from 1"
     )

@@ -36,7 +36,7 @@ from bms_estimator.pack.state import (
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import use_fitted_curves
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.learning import SlowFit, Submit, run_now
+from bms_estimator.pack_model.learning import FIT_INTERVAL_S, SlowFit, Submit, run_now
 from bms_estimator.pack_model.saved import fit_of_curves, history_of
 from bms_estimator.settings.pack import Settings
 
@@ -271,7 +271,8 @@ def new_pack(
     estimator = new_estimator(settings, model)
     slow_fit = None
     if estimator.identifying and settings.identifier.pack_model:
-        slow_fit = SlowFit(estimator, submit=submit, on_failure=on_failure)
+        interval_s = settings.identifier.fit_interval_s or FIT_INTERVAL_S
+        slow_fit = SlowFit(estimator, submit=submit, interval_s=interval_s, on_failure=on_failure)
     forecaster = None
     if estimator.identifying and isinstance(model, CellModel):
         cutoff_v = load_cutoff_v(settings, model)

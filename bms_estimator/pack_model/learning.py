@@ -118,10 +118,11 @@ class SlowFit:
         self.last_change: FitChange | None = None
         self._submit, self._interval_s, self._on_failure = submit, interval_s, on_failure
         self._pending: Future[PackFit] | None = None
+        self._fitted_rows: NDArray[np.void] = self.history.rows  # of the pending fit
         self._is_late = False
         self._new_rows = 0  # number of rows since the last fit
         self.saved_fit: PackFit | None = None
-        estimator.schedule(self._interval())
+        estimator.schedule(self.interval())
 
     def advance(self) -> None:
         """Take completed rows, and begin or end a fit that is due. Call it each time ``Estimator.run_part`` stops."""
@@ -161,10 +162,10 @@ class SlowFit:
         fitted_s = -math.inf if saved is None else saved.elapsed_s
         self._new_rows = int((self.history.rows["elapsed_s"] > fitted_s).sum())
         next_s = float(h["event_s"]) if restored else math.inf
-        self.estimator.schedule(min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self._interval()))
+        self.estimator.schedule(min(max(next_s, h["elapsed_s"]), h["elapsed_s"] + self.interval()))
         is_adopted = restored and self.fit is not None and saved is not None and self.fit.elapsed_s >= saved.elapsed_s
         if saved is not None and not is_adopted:
-            self._pending = run_now(lambda: saved)
+            self._pending, self._fitted_rows = run_now(lambda: saved), self.history.rows
             self.estimator.schedule(h["elapsed_s"] + ADOPT_DELAY_S)
 
     def forget(self) -> None:
@@ -174,7 +175,7 @@ class SlowFit:
         if self.bank:
             self.bank.reset()
         self.estimator.forget()
-        self.estimator.schedule(self._interval())
+        self.estimator.schedule(self.interval())
         self.revision += 1
 
     def adopt(self, fitted: PackFit) -> None:
@@ -231,11 +232,9 @@ class SlowFit:
         record: np.void = self.estimator.record[0]["history"]
         return record
 
-    def _interval(self) -> float:
+    def interval(self) -> float:
         """Return the interval until the next fit [s]; infinite if there are no fits."""
-        if math.isinf(self._interval_s):
-            return math.inf
-        return min(max(INTERVAL_OF_AGE * float(self._h["elapsed_s"]), MIN_INTERVAL_S), self._interval_s)
+        return fit_interval(float(self._h["elapsed_s"]), self._interval_s)
 
     def _handle_event(self) -> None:
         """Begin a fit, or end a pending one, at the time ``event_s`` of the record of the history."""
@@ -245,7 +244,7 @@ class SlowFit:
         elif self._pending.done():
             self._end_fit(self._pending)
             self._pending, self._is_late = None, False
-            self.estimator.schedule(h["event_s"] + (self._interval() - ADOPT_DELAY_S))
+            self.estimator.schedule(h["event_s"] + (self.interval() - ADOPT_DELAY_S))
         elif not self._is_late:  # ``event_s`` does not change, so that this function runs again after the next sample
             self.late += 1
             self._is_late = True
@@ -254,22 +253,15 @@ class SlowFit:
         """Begin a fit if there is enough new data with known currents, and set the time of the next event."""
         h = self._h
         rows, previous = self.history.rows, self.saved_fit
-        if self._has_grown() and unknown_current(rows) <= MAX_UNKNOWN_CURRENT:
-            self._new_rows = 0
+        if has_enough_data(rows, self._new_rows, previous):
+            self._new_rows, self._fitted_rows = 0, rows
             self._pending = self._submit(lambda: fit(self.cell, rows, previous))
             self.estimator.schedule(h["elapsed_s"] + ADOPT_DELAY_S)
             return
-        self.estimator.schedule(h["elapsed_s"] + self._interval())
+        self.estimator.schedule(h["elapsed_s"] + self.interval())
         if self.unsaved_rows:
             self.unsaved_rows = 0
             self.revision += 1
-
-    def _has_grown(self) -> bool:
-        """Return True if the history has enough new rows for a fit."""
-        previous, min_rows = self.saved_fit, float(MIN_ROWS)
-        if previous is not None and previous.covariance[FIT_SOC, FIT_SOC] <= MAX_CERTAIN_STD**2:
-            min_rows = max(min_rows, MIN_GROWTH * self.history.rows.size)
-        return self._new_rows >= min_rows
 
     def _end_fit(self, done: "Future[PackFit]") -> None:
         """Adopt the result of a completed fit if it is ready for use, or report its failure."""
@@ -277,7 +269,7 @@ class SlowFit:
         before, fit_before = (estimator.record.copy(), estimator.settings_record.copy()), self.fit
         try:
             fitted = done.result()
-            if self._is_adoptable(fitted):
+            if min_filter_std(fitted, self._fitted_rows) <= estimator.record[0]["filter"]["soc_std"]:
                 self.adopt(fitted)
             self.saved_fit, self._successive_failures = fitted, 0
         except Exception as error:  # noqa: BLE001 - a failed fit must not end the estimator
@@ -290,23 +282,53 @@ class SlowFit:
         self.unsaved_rows = 0
         self.revision += 1
 
-    def _is_adoptable(self, fitted: PackFit) -> bool:
-        """Return True if one normal distribution represents the SOC: its std is small, or the history is long.
-
-        In a short history with a known SOC or a gap the fit may know more than the filter, which learns neither capacity nor OCV
-        from an end of charge, and stops learning at a gap. It is then adopted unless it enlarges the std of the SOC.
-        """
-        rows, std = self.history.rows, math.sqrt(fitted.covariance[FIT_SOC, FIT_SOC])
-        if std <= MAX_SINGLE_STD or throughput(rows) >= MIN_THROUGHPUT_SOC:
-            return True
-        is_known = bool(np.isfinite(rows["reference_soc"]).any())
-        has_gap = bool(rows["segment"][0] != rows["segment"][-1])
-        return (is_known or has_gap) and std <= float(self.estimator.record[0]["filter"]["soc_std"])
-
     def _adopt_curves(self, fitted: PackFit | None) -> None:
         """Write the curves of a fit, or of the cell file, to the filter's settings."""
         self.fit = fitted
         use_fitted_curves(self.estimator, fitted)
+
+
+def fit_interval(elapsed_s: float, interval_s: float) -> float:
+    """Return the interval until the next fit [s].
+
+    Args:
+        elapsed_s: Age of the history [s].
+        interval_s: Maximum interval [s]; infinite: no fits.
+    """
+    return interval_s if math.isinf(interval_s) else min(max(INTERVAL_OF_AGE * elapsed_s, MIN_INTERVAL_S), interval_s)
+
+
+def has_enough_data(rows: NDArray[np.void], new_rows: int, previous: PackFit | None) -> bool:
+    """Return True if a history has enough new rows with known currents for a fit.
+
+    Args:
+        rows: Shape (n,), dtype HISTORY_ROW.
+        new_rows: Number of rows since the previous fit.
+        previous: Previous fit; None: no fit yet.
+    """
+    min_rows = float(MIN_ROWS)
+    if previous is not None and previous.covariance[FIT_SOC, FIT_SOC] <= MAX_CERTAIN_STD**2:
+        min_rows = max(min_rows, MIN_GROWTH * rows.size)
+    return new_rows >= min_rows and unknown_current(rows) <= MAX_UNKNOWN_CURRENT
+
+
+def min_filter_std(fitted: PackFit, rows: NDArray[np.void]) -> float:
+    """Return the std of the filter's SOC from which on a fit is adopted: 0 always, infinite never.
+
+    A fit is always adopted if one normal distribution represents the SOC: its std is small, or the history is long. In a short
+    history with a known SOC or a gap the fit may know more than the filter, which learns neither capacity nor OCV from an end of
+    charge, and stops learning at a gap. It is then adopted unless it enlarges the std of the SOC.
+
+    Args:
+        fitted: The fit.
+        rows: Fitted rows, shape (n,), dtype HISTORY_ROW.
+    """
+    std = math.sqrt(fitted.covariance[FIT_SOC, FIT_SOC])
+    if std <= MAX_SINGLE_STD or throughput(rows) >= MIN_THROUGHPUT_SOC:
+        return 0.0
+    is_known = bool(np.isfinite(rows["reference_soc"]).any())
+    has_gap = bool(rows["segment"][0] != rows["segment"][-1])
+    return std if is_known or has_gap else math.inf
 
 
 def unknown_current(rows: NDArray[np.void]) -> float:

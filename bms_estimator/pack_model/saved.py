@@ -31,7 +31,7 @@ MAX_RESULT = 20.0
 MAX_COST = 1e15
 """Maximum plausible absolute cost of a fit."""
 _RESULT = (-MAX_RESULT, MAX_RESULT)
-_SHAPES = {
+FIT_SHAPES = {
     "elapsed_s": (),
     "segment": (),
     "charge_as": (),
@@ -70,7 +70,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 def curve_arrays(fit: PackFit | None) -> dict[str, NDArray[Any]]:
     """Return the curves and results of a fit by name; empty without a fit."""
-    return {} if fit is None else {name: np.array(getattr(fit, name)) for name in _SHAPES}
+    return {} if fit is None else {name: np.array(getattr(fit, name)) for name in FIT_SHAPES}
 
 
 def fit_of_curves(arrays: Arrays) -> PackFit | None:
@@ -82,7 +82,7 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
     if not arrays:
         return None
     values: dict[str, Any] = {}
-    for name, shape in _SHAPES.items():
+    for name, shape in FIT_SHAPES.items():
         value = _fit_field(arrays, name)
         if value.shape != shape:
             raise ValueError(f"{name} of the fit is damaged")
@@ -110,7 +110,7 @@ def _fit_field(arrays: Arrays, name: str) -> Floats:
 
 def neutral_fit() -> PackFit:
     """Return a fit that corrects nothing. The service adopts it before the first sample to compile the code."""
-    values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in _SHAPES.items()}
+    values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in FIT_SHAPES.items()}
     values |= {"covariance": np.eye(_RESULTS), "hysteresis": 1.0}
     none = np.zeros(0)
     return PackFit(**values, row_elapsed_s=none, row_soc=none, curves=())
@@ -142,7 +142,7 @@ def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
 
 def _first_discharges(arrays: Arrays) -> ReferenceDischarges | None:
     """Return the first discharges of a bank; None if none were saved."""
-    fit = fit_of_curves({name: arrays[BANK + name] for name in _SHAPES if BANK + name in arrays})
+    fit = fit_of_curves({name: arrays[BANK + name] for name in FIT_SHAPES if BANK + name in arrays})
     return None if fit is None else ReferenceDischarges(_rows(arrays, "bank_rows"), fit)
 
 
@@ -161,7 +161,7 @@ def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
         ValueError: A field is missing, or has another layout or an implausible value.
     """
     history = History(_rows(arrays, "rows"), _weak_cell_times(arrays), _first_discharges(arrays))
-    fit = fit_of_curves({name: value for name, value in arrays.items() if name in _SHAPES})
+    fit = fit_of_curves({name: value for name, value in arrays.items() if name in FIT_SHAPES})
     if fit is None:
         return history, None
     elapsed_s, soc, curves = (_fit_field(arrays, name) for name in ("row_elapsed_s", "row_soc", "curves"))

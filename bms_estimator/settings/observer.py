@@ -74,7 +74,7 @@ class ObserverSettings(Strict):
 
 
 class _IdentifierSwitches(Strict):
-    """Switches of ``[identifier]``. The workers of a fleet always run the identifier, and never the fit of a pack's history."""
+    """Switches of ``[identifier]``. The packs of a fleet always have both."""
 
     enabled: bool = Field(
         default=True,
@@ -82,8 +82,8 @@ class _IdentifierSwitches(Strict):
     )
     pack_model: bool = Field(
         default=True,
-        repr=False,  # not part of the digest of a fleet's settings, because a fleet's worker does not fit
-        description="a fit to the pack's history of weeks, each hour, gives its own OCV curve, capacity and resistances; false: these are the cell file's with the corrections that the filter learns",
+        repr=False,  # not part of the digest of a fleet's settings
+        description="a fit to the pack's history of weeks gives its own OCV curve, capacity and resistances; false: these are the cell file's with the corrections that the filter learns",
     )
 
 
@@ -107,6 +107,11 @@ class IdentifierValues(Strict):
     hysteresis_v: NotNegative | None = Field(
         default=None,
         description="OCV of one cell after charge minus its OCV after discharge; default: hysteresis in the cell file",
+    )
+    fit_interval_s: Annotated[float, Field(ge=600)] | None = Field(
+        default=None,
+        repr=False,  # not part of the digest of a fleet's settings, because a state does not depend on it
+        description="maximum interval between two fits of the pack's model; default: 3600, in a fleet 86400",
     )
 
 

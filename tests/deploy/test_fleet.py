@@ -20,7 +20,12 @@ NODES = "a.example,b.example,c.example"
 
 
 @pytest.fixture(
-    params=["bms-estimator-fleet.service", "bms-estimator-ingest.service", "bms-estimator-worker@1.service"]
+    params=[
+        "bms-estimator-fleet.service",
+        "bms-estimator-fit.service",
+        "bms-estimator-ingest.service",
+        "bms-estimator-worker@1.service",
+    ]
 )
 def unit(request: pytest.FixtureRequest, deploy: Path, tmp_path: Path) -> Path:
     """Return a unit whose program is replaced by one that exists on this machine."""

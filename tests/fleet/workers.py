@@ -26,6 +26,7 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoi
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.command_line import PROGRAM
+from tests.fleet.partition_stream import estimates_of
 from tests.patience import LONG_S
 
 PERIOD_S = 10.0
@@ -137,6 +138,23 @@ class Process:
         self._process.wait(LONG_S)
 
 
+class Fitter:
+    """Process ``fleet fit``, which starts at once and logs to a file."""
+
+    def __init__(self, folder: Path, url: str) -> None:
+        with (folder / "fit.log").open("a") as log:
+            self._process = subprocess.Popen([str(PROGRAM), "fleet", "fit", "--server", url], stderr=log)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait(LONG_S)
+
+    def end(self) -> int:
+        """Send SIGTERM and return the exit code."""
+        self._process.terminate()
+        return self._process.wait(LONG_S)
+
+
 class Heartbeats:
     """Subscriber to heartbeats. ``last`` is the last heartbeat of each worker."""
 
@@ -206,4 +224,4 @@ def record_of_run(registry: PackRegistry, pack: str, rows: SampleBlock) -> bytes
     assert cell
     estimator = make_estimator(settings, cell)
     estimator.run(rows)
-    return estimator.record.tobytes()
+    return estimates_of(estimator.record)

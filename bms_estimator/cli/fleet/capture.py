@@ -17,7 +17,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.sinks.trace_file import join_columns, table_sink
 
 if TYPE_CHECKING:
-    from bms_estimator.fleet.identification.block_capture import BlockCapture
+    from bms_estimator.fleet.nats.block_capture import BlockCapture
 
 TIME_EXAMPLE = "2026-01-31 or 2026-01-31T12:00"
 """Example of a start time in help texts."""
@@ -96,7 +96,7 @@ async def fetch_blocks(pack: str, since_s: float, until_s: float, address: Serve
     Raises:
         UserError: The server cannot be reached.
     """
-    from bms_estimator.fleet.identification.block_capture import fetch  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.nats.block_capture import fetch  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
 
     async with connected(*address) as nc:

@@ -17,6 +17,9 @@ COMMANDS = {
     "worker": LazyCommand(
         "bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."
     ),
+    "fit": LazyCommand(
+        "bms_estimator.cli.fleet.fit:fit", "Fit the models of packs to their histories, once a day for each pack."
+    ),
     "ingest": LazyCommand(
         "bms_estimator.cli.fleet.ingest:ingest", "Receive batches of samples from a telemetry platform."
     ),
@@ -38,9 +41,6 @@ COMMANDS = {
     "packs": LazyCommand("bms_estimator.cli.fleet.packs:app", "Upload, list, show or remove the settings of packs."),
     "capture": LazyCommand(
         "bms_estimator.cli.fleet.capture:capture", "Write a pack's stored samples to a CSV or Parquet file."
-    ),
-    "identify": LazyCommand(
-        "bms_estimator.cli.fleet.identify:identify", "Re-identify packs from their stored samples."
     ),
     "collect": LazyCommand(
         "bms_estimator.cli.fleet.queries:collect", "Write hourly summaries of all packs to Parquet files."

@@ -210,7 +210,6 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
         "earlier checkpoints in the server's files, until nats-server compacts these",
         "last states on running fleet pages, until these are restarted",
         "backups of the server and of the Parquet files, files of `fleet capture`, logs of workers",
-        "cell files of-PACK that `fleet identify --put` has uploaded",
     ]
     typer.echo("\n  ".join(["remaining:", *remaining]))
 

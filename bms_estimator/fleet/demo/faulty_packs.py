@@ -31,7 +31,9 @@ FUTURE_VERSION = VERSION + 1
 """Version of the undecodable block."""
 _VERSION_OFFSET = 4
 """Offset of the version in a block [bytes]."""
-_KIND = KINDS[0]
+_KIND_INDEX = 1
+"""Index of the kind of the packs, an NMC battery, whose OCV shows the SOC of a cell."""
+_KIND = KINDS[_KIND_INDEX]
 
 
 def table() -> str:
@@ -76,7 +78,7 @@ async def ask_weak_cell(processes: Processes, folder: Path) -> dict[str, Any]:
 def _blocks(fleet: SimulatedFleet, now_s: float) -> Iterator[tuple[str, bytes]]:
     """Yield names and encoded blocks."""
     numbers = np.arange(1, BLOCKS + 1)
-    samples = fleet.samples(np.zeros_like(numbers), numbers)
+    samples = fleet.samples(np.full_like(numbers, _KIND_INDEX), numbers)
     begin_s = now_s - BLOCKS * BLOCK_S
     others_v = -DEVIATION_V / (_KIND.series - 1)
     deviation_v = np.where(np.arange(_KIND.series) == CELL - 1, DEVIATION_V, others_v)

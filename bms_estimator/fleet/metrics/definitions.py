@@ -27,6 +27,10 @@ EVENTS = {
     "failed": "blocks skipped because of an internal error",
     "lethal": "blocks skipped because workers died in them",
     "repeated": "messages that the stream delivered again",
+    "fits": "adopted fits of packs",
+    "late_fits": "fits without a result at the time of their adoption",
+    "failed_fits": "fits whose adoption failed",
+    "stale_fits": "results of fits that the pack no longer awaits",
     "dropped_samples": "samples that the estimator rejected",
     "time_steps_back": "samples whose time decreased",
     "no_time": "samples with an implausible time",
@@ -158,7 +162,7 @@ WORKER: tuple[Definition[Heartbeat], ...] = (
     ),
     Definition(
         "bms_fleet_worker_waiting_summaries",
-        "Hourly summaries that are not acknowledged yet",
+        "Hourly summaries and messages of histories that are not acknowledged yet",
         lambda h: h.hours_waiting,
     ),
     Definition(

@@ -21,8 +21,10 @@ HOUR_ROW_BYTES = 1900
 """Size of an hourly summary in ``HOURS``, with the server's overhead [bytes]."""
 STATE_BYTES = 42_000
 """Maximum size of a pack in a checkpoint [bytes]."""
-DAILY_STATE_BYTES = 19_000
-"""Size of a pack in a checkpoint after 24 h [bytes], which is nearly that of a daily checkpoint."""
+DAILY_STATE_BYTES = 26_000
+"""Size of a pack in a checkpoint after 24 h, with a fit [bytes], which is nearly that of a daily checkpoint."""
+HISTORY_BYTES = 1_000_000
+"""Maximum size of a pack's history with its last fit [bytes]."""
 CELL_BLOCK_BYTES = 60
 """Additional size of a block of 60 samples for the voltages of each cell [bytes]."""
 MEAN_VOLTAGE_BLOCK_BYTES = 160
@@ -49,11 +51,13 @@ class StreamSizes:
     """Stream ``RAW``."""
     states: int
     """Stream ``OBJ_states``."""
+    history: int
+    """Stream ``HISTORY``."""
 
     @property
     def total(self) -> int:
         """All streams, including ``HOURS`` and ``DEAD``, whose sizes are fractions of that of ``RAW``."""
-        return round(self.raw * (1.0 + HOURS_FRACTION + DEAD_FRACTION)) + self.states
+        return round(self.raw * (1.0 + HOURS_FRACTION + DEAD_FRACTION)) + self.states + self.history
 
 
 def stream_sizes(packs: int, outage_days: float, cells: int = 0) -> StreamSizes:
@@ -71,7 +75,8 @@ def stream_sizes(packs: int, outage_days: float, cells: int = 0) -> StreamSizes:
     states_bytes = packs * (
         LAST_CHECKPOINTS * STATE_BYTES + DAILY_CHECKPOINTS * DAILY_STATE_BYTES + checkpoints * cells * CELL_STATE_BYTES
     )
-    return StreamSizes(raw=round(max(fleet_bytes, one_pack_bytes)), states=max(states_bytes, MIN_STATES_BYTES))
+    raw_bytes = round(max(fleet_bytes, one_pack_bytes))
+    return StreamSizes(raw_bytes, states=max(states_bytes, MIN_STATES_BYTES), history=packs * HISTORY_BYTES)
 
 
 def block_bytes(cells: int) -> int:

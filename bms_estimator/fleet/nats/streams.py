@@ -46,6 +46,8 @@ MIN_PACK_BLOCKS = 60
 """Minimum number of stored blocks of a pack, even in a small ``RAW``: an hour of minute blocks."""
 DUPLICATES_S = 3600.0
 """Time within which the server drops a summary with a repeated message id [s]."""
+HISTORY_PACK_MESSAGES = 500
+"""Maximum number of stored messages of a pack in ``HISTORY``: 6,000 rows, more than a history has."""
 GROUP = "w"
 """Priority group of the consumers."""
 PIN_S = 2.0
@@ -74,6 +76,7 @@ async def make_streams(
     raw_bytes: int = RAW_BYTES,
     raw_age_s: float = RAW_AGE_S,
     states_bytes: int = UNLIMITED,
+    history_bytes: int = UNLIMITED,
 ) -> None:
     """Create missing streams and consumers, and set limits and replicas as configured. The function is idempotent.
 
@@ -84,6 +87,7 @@ async def make_streams(
         raw_bytes: Maximum size of ``RAW`` [bytes]; beyond it the oldest messages are dropped.
         raw_age_s: Maximum age of messages in ``RAW`` [s].
         states_bytes: Maximum size of the checkpoints [bytes]; beyond it the workers remove daily ones.
+        history_bytes: Maximum size of the histories [bytes]; beyond it the oldest messages are dropped.
 
     Raises:
         UserError: The streams have another number of partitions, or the server has too little disk space.
@@ -99,6 +103,7 @@ async def make_streams(
         _raw_stream(partitions, raw_bytes, raw_age_s),
         _hours_stream(raw_bytes),
         _dead_stream(raw_bytes),
+        *_fit_streams(history_bytes),
         *_bucket_streams(states_bytes),
     )
     for stream in streams:
@@ -177,6 +182,7 @@ def _raw_stream(partitions: int, max_bytes: int, age_s: float) -> dict[str, Any]
         subjects.RAW_STREAM,
         subjects.raw("*"),
         subjects.table_change(),
+        subjects.fit(),
         subject_transform={"src": source, "dest": destination},
         metadata={PARTITIONS_KEY: str(partitions)},
         **limits,
@@ -204,6 +210,22 @@ def _dead_stream(raw_bytes: int) -> dict[str, Any]:
     return _stream(subjects.DEAD_STREAM, subjects.dead(), **limits)
 
 
+def _fit_streams(history_bytes: int) -> list[dict[str, Any]]:
+    """Return the streams of the histories, and of the requests for fits, of which each pack has one at most."""
+    history = {
+        "max_bytes": history_bytes,
+        "max_msgs_per_subject": HISTORY_PACK_MESSAGES,
+        "discard": "old",
+        "allow_direct": True,
+        "allow_rollup_hdrs": True,
+    }
+    requests = {"max_msgs_per_subject": 1, "discard": "old", "retention": "workqueue"}
+    return [
+        _stream(subjects.HISTORY_STREAM, subjects.history(), duplicate_window=_ns(DUPLICATES_S), **history),
+        _stream(subjects.FITS_STREAM, subjects.fit_request(), **requests),
+    ]
+
+
 def _bucket_streams(states_bytes: int) -> list[dict[str, Any]]:
     common = {"discard": "new", "allow_rollup_hdrs": True, "allow_direct": True}
     states = subjects.STATES_BUCKET
@@ -217,7 +239,7 @@ def _bucket_streams(states_bytes: int) -> list[dict[str, Any]]:
 
 
 def _stream(name: str, *subject_names: str, **options: Any) -> dict[str, Any]:
-    return {"name": name, "subjects": list(subject_names), "storage": "file", "retention": "limits", **options}
+    return {"name": name, "subjects": list(subject_names), "storage": "file", "retention": "limits"} | options
 
 
 async def _ensure_stream(nc: Client, stream: dict[str, Any]) -> None:

@@ -26,8 +26,9 @@ from bms_estimator.settings.pack import DeviceName, PackSettings, PackValues, Se
 from bms_estimator.settings.sensor import GainStd, SensorSettings
 
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
-"""Pattern of a cell's name. It may be longer than a pack's name, because ``fleet identify`` names cell files after
-packs."""
+"""Pattern of a cell's name."""
+FIT_INTERVAL_S = 86_400.0
+"""Default maximum interval between two fits of a pack [s]."""
 _SECTIONS: dict[str, type[Strict]] = {"pack": PackSettings, "sensor": SensorSettings, "identifier": IdentifierSettings}
 """Sections of a settings file whose values come from a specification."""
 
@@ -107,7 +108,7 @@ def settings_of(row: PackSpec) -> Settings:
     values = row.model_dump(exclude_none=True)
     if isinstance(row, PackRow):
         values["name"] = row.pack
-    values["pack_model"] = False  # a worker does not fit, and a replay with these settings gives its estimates
+    values.setdefault("fit_interval_s", FIT_INTERVAL_S)
     return Settings.model_validate(
         {
             section: {name: values[name] for name in model.model_fields if name in values}

@@ -9,8 +9,6 @@ The message consists of ``MAGIC`` and a JSON object with the fields of ``PackSou
 import json
 from typing import NamedTuple
 
-from bms_estimator.edge.subjects import is_table_change
-
 MAGIC = b"BMST"
 """First bytes of the message; those of a block differ."""
 
@@ -27,18 +25,6 @@ class PackSource(NamedTuple):
 def is_change(data: bytes) -> bool:
     """Return True if a message of the stream is a change of the table."""
     return data.startswith(MAGIC)
-
-
-def trusted_data(subject: str, data: bytes) -> bytes:
-    """Return the data of a stored message, or empty data if an edge has sent a change of the table in place of a block.
-
-    Only workers may send changes of the table. Empty data are rejected as a damaged block.
-
-    Args:
-        subject: Subject under which the stream ``RAW`` stores the message.
-        data: Data of the message.
-    """
-    return b"" if is_change(data) and not is_table_change(subject) else data
 
 
 def encode_change(source: PackSource | None) -> bytes:

@@ -61,9 +61,7 @@ QUERIES = {
     "honest": Query(("days", "packs"), "how often the SOC was within 2 std, compared with later estimates"),
     "silent": Query(("days", "packs"), "packs without recent hours"),
     "weak-cells": Query(("days", "packs"), "packs in which one series cell is below the others in most recent hours"),
-    "imbalance": Query(
-        ("days", "packs", "cell_days"), "packs whose cells differ at rest, and the trend of the difference"
-    ),
+    "imbalance": Query(("days", "packs"), "packs whose cells differ in SOC, and the trend of the difference"),
     "self-discharge": Query(
         ("days", "packs"), "cells that discharge themselves, for example by an internal short, with their current"
     ),
@@ -84,7 +82,7 @@ class Limits:
     r_s_fresh_s: float = 86_400.0
     """Maximum time since R_s was last identified [s]; older values are not used."""
     min_days: int = 7
-    """Queries soh, failing, imbalance, self-discharge: minimum number of days in a trend."""
+    """Queries soh, failing, imbalance: minimum number of days in a trend."""
     min_packs: int = 5
     """Query outliers: minimum number of packs with a valid value that define the reference of their type."""
     min_spread: float = 0.01
@@ -92,10 +90,10 @@ class Limits:
     recent_days: int = 3
     """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault.
     Queries weak-cells, imbalance and self-discharge use the rows of these days."""
-    weak_cell_v: float = 0.02
-    """Query weak-cells: minimum mean deviation of the weakest cell below the mean of the cells [V]."""
-    imbalance_v: float = 0.02
-    """Query imbalance: minimum difference between the highest and the lowest cell at rest [V]."""
+    weak_cell_soc: float = 0.05
+    """Query weak-cells: minimum mean deviation of the weakest cell below the mean of the cells [SOC]."""
+    imbalance_soc: float = 0.05
+    """Query imbalance: minimum difference between the highest and the lowest cell [SOC]."""
     self_discharge_c: float = MIN_SHORT_C
     """Query self-discharge: minimum self-discharge of a cell above the median cell, as a C-rate [1/h]."""
     silent_hours: int = 2

@@ -7,11 +7,12 @@ snapshots consistent:
   worker may remove a checkpoint during its snapshot after it has written two later ones. Then the first checkpoint of the day
   remains, which the pointer also names.
 - ``RAW`` comes after the checkpoints, so that it has all messages that they include, and all later ones up to its snapshot.
-  ``HOURS`` and ``DEAD`` also come after the checkpoints, because a worker sends to them before it writes a checkpoint.
+  ``HOURS``, ``DEAD`` and ``HISTORY`` also come after the checkpoints, because a worker sends to them before it writes a
+  checkpoint.
 - The table comes after ``RAW``, so that it has a row for each pack in ``RAW``. Rows come before the cell files that they name.
 
 The stream ``TELEMETRY`` of ``fleet ingest`` is not part of a backup, because a batch waits there only until ``fleet ingest`` has
-its samples in blocks on its own disk.
+its samples in blocks on its own disk. ``FITS`` is not part of it, because workers repeat unanswered requests.
 """
 
 import contextlib
@@ -51,6 +52,7 @@ BACKUP_ORDER = (
     f"OBJ_{subjects.STATES_BUCKET}",
     subjects.HOURS_STREAM,
     subjects.DEAD_STREAM,
+    subjects.HISTORY_STREAM,
     subjects.RAW_STREAM,
     f"KV_{subjects.PACKS_BUCKET}",
     f"KV_{subjects.CELLS_BUCKET}",

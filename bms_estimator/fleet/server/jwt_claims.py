@@ -76,6 +76,9 @@ _WORKER_PUBLISH = (
     "hours.*",
     "dead.*.*",
     "table.*",
+    "history.*",
+    "fits.*",
+    "fit.*",
     "fleet.>",
     "_INBOX.>",
 )

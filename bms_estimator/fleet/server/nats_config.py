@@ -18,9 +18,8 @@ MONITOR_PORT = 8222
 """Default TCP port of the monitor, which has no authentication and listens on the loopback only."""
 CLUSTER_PORT = 6222
 """Default TCP port for the other nodes of a cluster."""
-MAX_PAYLOAD_BYTES = 1 << 20
-"""Maximum size of a message [bytes]. A block of 60 samples has 700 bytes. A block of a whole day at 1 Hz is smaller than
-this limit."""
+MAX_PAYLOAD_BYTES = 2 << 20
+"""Maximum size of a message [bytes]. A block of 60 samples has 700 bytes, and the longest history of a pack with its fit 0.9 MB."""
 MAX_CONNECTIONS = 200_000
 """Maximum number of connections of a node. If two of three nodes are down, all edges connect to the third node. The
 server's default is 65,536."""

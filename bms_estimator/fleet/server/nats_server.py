@@ -23,10 +23,10 @@ from bms_estimator.fleet.server.nats_config import configuration
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check_node_disk, check_tls_files, node_of
 from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
-from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.child_process import ends_with_us
+from bms_estimator.process.nats_server_program import find_server
 from bms_estimator.process.private_file import write_private
 
 log = structlog.get_logger(__name__)

@@ -49,6 +49,7 @@ async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant
             raw_bytes=sizes.raw,
             raw_age_s=86_400.0 * (tenant.outage_days or server.outage_days),
             states_bytes=sizes.states,
+            history_bytes=sizes.history,
         )
     except NoAnswerError:
         raise

@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 from bms_estimator.checkpoint.identity import without_observer
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.estimator.restore import restore_state
+from bms_estimator.fleet.fits.messages import FitResult
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType
-from bms_estimator.fleet.worker import cell_summary, hour_summary
-from bms_estimator.fleet.worker.density import MAX_TIMESTAMP_S
-from bms_estimator.fleet.worker.edge_clock import Arrival, clock_error_s
+from bms_estimator.fleet.worker import hour_summary
+from bms_estimator.fleet.worker.block_checks import MAX_TIMESTAMP_S, Arrival, clock_error_s
+from bms_estimator.fleet.worker.block_result import BlockResult
+from bms_estimator.fleet.worker.pack_fits import PackFits
 from bms_estimator.fleet.worker.pack_state import (
     CONFIG_DIGEST,
     LAST_STORE_NS,
@@ -28,6 +31,7 @@ from bms_estimator.fleet.worker.pack_state import (
 from bms_estimator.fleet.worker.single_cells import SingleCells, known_voltages
 from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.forecast.forecast import Forecast, unknown_values
+from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.payload import Payload
@@ -42,14 +46,11 @@ MAX_WALL_S = 2.0**34
 """Latest plausible wall clock [s since 1970]: the year 2514."""
 MAX_PART_SAMPLES = 4096
 """Maximum number of samples that are estimated at a time. It limits the buffer of estimates of 200 bytes each, which
-exists for each type of pack in each partition."""
+exists for each partition."""
 NO_PEAK_A = 0.0
 """Peak current for ``write_usable_charge`` [A]. A worker does not store the peaks of the load. With 0, the mean current is
 used."""
 NO_FORECAST_REASON = "a fleet worker makes no forecasts"
-
-Publications = tuple[bytes | None, bytes | None, bytes | None, tuple[tuple[str, bytes], ...]]
-"""Payloads of the topics ``state``, ``parameters`` and ``cells``, and message ids and rows of finished hours."""
 
 
 class BlockProcessor:
@@ -65,14 +66,16 @@ class BlockProcessor:
         record = unpacked.record
         self._record, self._counters, self._wall = record, counters, wall
         self._single_cells = SingleCells(unpacked)
+        self._fits = PackFits(record, counters)
+        self._trace: TraceBlock = np.zeros(0, TRACE)
         self._delivery, self._charge_energy, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
         self._observer = record[0]["estimator"]["observer"]
         self._window = Window()
 
     def step(
         self, pack: str, block: Block, arrival: Arrival, pack_type: PackType, unmigrated_fields: Fields | None
-    ) -> Publications:
-        """Estimate the pack's next block and return the resulting messages.
+    ) -> BlockResult:
+        """Estimate the pack's next block.
 
         Args:
             pack: Name of the pack.
@@ -82,7 +85,10 @@ class BlockProcessor:
             unmigrated_fields: Estimator fields that another version saved; None if they are already in the record.
         """
         self._check_times(block.samples)
-        self._restore_or_reset(pack_type, unmigrated_fields, block)
+        self._fits.use_curves(pack, pack_type)
+        if self._restore_or_reset(pack_type, unmigrated_fields, block):
+            self._fits.use_curves(pack, pack_type)
+        self._fits.begin_block(pack, pack_type, arrival.sequence)
         self._single_cells.begin(pack_type.cells)
         rows, is_new_hour = self._roll_over_hour(pack, block, arrival, pack_type)
         self._check_clock(block, arrival)
@@ -99,18 +105,24 @@ class BlockProcessor:
             parameters = self._parameters_payload(pack_type.estimator, arrival_s, now_s)
             report = self._single_cells.payload(pack_type.short_limit_a, now_s)
             cells = None if report is None else _json(report)
-        return state, parameters, cells, rows
+        return BlockResult(
+            pack, state=state, parameters=parameters, cells=cells, hours=rows, history=self._fits.take_messages()
+        )
+
+    def receive_fit(self, result: FitResult, sequence: int, pack_type: PackType) -> bool:
+        """Process the result of a fit (``PackFits.receive``)."""
+        return self._fits.receive(result, sequence, pack_type)
 
     def reset_window(self) -> None:
         """Drop the samples of a failed block from the publish window."""
         self._window = Window()
 
-    def _restore_or_reset(self, pack_type: PackType, unmigrated_fields: Fields | None, block: Block) -> None:
-        """Adapt the pack's state to its present settings and this version. Reset an incompatible state."""
+    def _restore_or_reset(self, pack_type: PackType, unmigrated_fields: Fields | None, block: Block) -> bool:
+        """Adapt the pack's state to its present settings and this version. Reset an incompatible state. Return True if it has changed."""
         d, record = self._delivery, self._record[0]
         is_same_config = _digest(d[CONFIG_DIGEST]) == pack_type.config_digest
         if is_same_config and unmigrated_fields is None:
-            return
+            return False
         has_state = bool(self._hour["store"])  # 0 before the first block
         if _digest(d[STATE_DIGEST]) == pack_type.state_digest and has_state:
             saved = unmigrated_fields
@@ -127,12 +139,14 @@ class BlockProcessor:
             self._hour["outliers_before"] = self._hour["searches_before"] = 0
             self._counters["not_taken_over" if error else "taken_over"] += 1
         else:
-            for name in ("flow", "hour", "cells", "estimator"):
+            for name in ("flow", "hour", "fit", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
             d[LAST_STORE_NS] = d["hour"] = d["clock_error_s"] = 0
             self._single_cells.reset()
             self._counters["begun_anew"] += has_state
+        self._fits.restart()
         d[CONFIG_DIGEST], d[STATE_DIGEST] = pack_type.config_digest, pack_type.state_digest
+        return True
 
     def _resume_after_store_change(self, estimator: Estimator, block: Block) -> None:
         """Resume the estimator after a gap if the edge's store is another one than for the last sample.
@@ -156,17 +170,32 @@ class BlockProcessor:
         pack_type.meter.continue_from(
             ChargeEnergy(*(float(self._charge_energy[name]) for name in ChargeEnergy._fields))
         )
-        for part in _parts(block):
-            trace = pack_type.estimator.run(part.samples)
+        for part, trace in self._run(block, pack_type):
             hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
             pack_type.meter.add(trace)
             self._window.add(trace, arrival_s, known_voltages(part.cells_v))
             self._single_cells.run(part, trace)
-        cell_summary.add(self._record[0]["cells"], block, hour_summary.rest_current_a(pack_type.estimator))
+            self._fits.advance(pack_type)
         counters["blocks"] += 1
         counters["samples"] += block.samples.size
         counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted_before)
         counters["time_steps_back"] += int(observer["time_steps_back"]) - steps_back_before
+
+    def _run(self, block: Block, pack_type: PackType) -> Iterator[tuple[Block, TraceBlock]]:
+        """Yield parts of a block, each with its estimates. A part ends where ``PackFits`` must take rows or adopt a fit."""
+        if self._trace.size < min(block.samples.size, MAX_PART_SAMPLES):
+            self._trace = np.zeros(min(block.samples.size, MAX_PART_SAMPLES), TRACE)
+        start = 0
+        while start < block.samples.size:
+            samples = block.samples[start : start + MAX_PART_SAMPLES]
+            used, written = pack_type.estimator.run_part(samples, self._trace)
+            part = slice(start, start + used)
+            is_whole = used == block.samples.size
+            yield (
+                block if is_whole else replace(block, samples=block.samples[part], cells_v=block.cells_v[part]),
+                self._trace[:written],
+            )
+            start += used
 
     def _state_payload(self, pack_type: PackType, now_s: float) -> bytes | None:
         """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
@@ -235,13 +264,10 @@ class BlockProcessor:
         if current:
             settings = pack_type.settings.model_copy(update={"name": pack})
             row = hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)
-            cells = cell_summary.values(self._record[0]["cells"])
-            cells |= self._single_cells.row_fields(cells.get("weakest_cell"))
-            row = row.model_copy(update=cells | self._origin(arrival))
+            row = row.model_copy(update=self._single_cells.row_fields() | self._origin(arrival))
             # the collector sets missing values to null, so that a pack without cell voltages has a shorter row
             rows = ((f"{pack}.{current}.{arrival.sequence}", row.model_dump_json(exclude_defaults=True).encode()),)
         hour_summary.begin(self._record["hour"], self._record[0]["estimator"])
-        self._record[0]["cells"] = np.zeros((), PACK_STATE["cells"])
         self._delivery["hour"], self._delivery["clock_error_s"] = hour, 0.0
         return rows, True
 
@@ -269,16 +295,6 @@ class BlockProcessor:
             return block.arrival_s
         self._counters["no_arrival"] += 1
         return block.store_created_ns / 1e9 + float(self._delivery["last_s"])
-
-
-def _parts(block: Block) -> Iterator[Block]:
-    """Split a block into parts of at most ``MAX_PART_SAMPLES`` samples."""
-    if block.samples.size <= MAX_PART_SAMPLES:
-        yield block
-        return
-    for first in range(0, block.samples.size, MAX_PART_SAMPLES):
-        part = slice(first, first + MAX_PART_SAMPLES)
-        yield replace(block, samples=block.samples[part], cells_v=block.cells_v[part])
 
 
 def _finite_times_s(samples: SampleBlock) -> NDArray[np.float64]:

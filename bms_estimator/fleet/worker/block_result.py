@@ -10,6 +10,15 @@ INTERNAL_ERROR = "internal error; the log of the worker has the traceback"
 """Reason for the dead letter of a block that was skipped because of an internal error."""
 
 
+class HistoryMessage(NamedTuple):
+    """Rows of a pack's history, or a request for a fit, which the server stores."""
+
+    subject: str
+    data: bytes
+    message_id: str
+    """Equal for all workers, so that the server drops repetitions."""
+
+
 class BlockResult(NamedTuple):
     """Result of a message.
 
@@ -21,6 +30,7 @@ class BlockResult(NamedTuple):
         cells: Payload of topic ``cells``; None without one.
         hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
             drops repeated rows.
+        history: Messages of the pack's history.
         failed: Number of blocks that were skipped because of an internal error.
         dead_reason: Reason why the block becomes a dead letter; empty if it does not become one.
     """
@@ -31,5 +41,6 @@ class BlockResult(NamedTuple):
     parameters: bytes | None = None
     cells: bytes | None = None
     hours: tuple[tuple[str, bytes], ...] = ()
+    history: tuple[HistoryMessage, ...] = ()
     failed: int = 0
     dead_reason: str = ""

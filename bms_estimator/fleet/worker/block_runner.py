@@ -17,12 +17,55 @@ from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.table_change import is_change
 from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, BlockResult
-from bms_estimator.fleet.worker.cpu_budget import CpuBudget
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage
+from bms_estimator.fleet.worker.raw_messages import is_block
 from bms_estimator.fleet.worker.replay_guard import ReplayGuard
 from bms_estimator.fleet.worker.result_publisher import ResultPublisher
 from bms_estimator.fleet.worker.table_change_sender import TableChangeSender
+
+MAX_CPU_FRACTION = 0.1
+"""Fraction of a core that a pack may use continuously. A source at 1,000 Hz needs 0.005."""
+BURST_S = 0.2
+"""Processor time that a pack may use in a burst after a pause [s], enough for 500 minute blocks at 1 Hz."""
+MAX_CHARGE_S = 0.1
+"""Maximum processor time that is charged for one block [s], the cost of 20,000 samples. The first block may take longer,
+because it compiles kernels."""
+MAX_PACKS = 10_000
+"""Number of stored bucket levels above which the levels of idle packs, which are 0, are removed."""
+
+
+class CpuBudget:
+    """Processor-time budget: a leaky bucket for each pack.
+
+    Args:
+        clock: Monotonic clock [s].
+
+    Attributes:
+        total_s: Processor time of all packs [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self.total_s = 0.0
+        # level of each pack's bucket [s], and the time at which the level was computed [s]
+        self._levels: dict[str, tuple[float, float]] = {}
+
+    def is_exhausted(self, pack: str) -> bool:
+        """Return True if a pack has used up its budget."""
+        return self._level_s(pack) > BURST_S
+
+    def charge(self, pack: str, cpu_s: float) -> None:
+        """Count processor time that a pack has used [s]."""
+        self.total_s += cpu_s
+        self._levels[pack] = self._level_s(pack) + min(cpu_s, MAX_CHARGE_S), self._clock()
+        if len(self._levels) > MAX_PACKS:
+            self._levels = {name: level for name, level in self._levels.items() if self._level_s(name)}
+
+    def _level_s(self, pack: str) -> float:
+        level_s, at_s = self._levels.get(pack, (0.0, 0.0))
+        return max(level_s - MAX_CPU_FRACTION * (self._clock() - at_s), 0.0)
+
 
 log = structlog.get_logger(__name__)
 
@@ -142,7 +185,7 @@ class BlockRunner:
             result = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR)
         self.budget.charge(pack, time.thread_time() - begin_s)
         self.faults += result.failed
-        self._results.queue_summaries(result)
+        self._results.queue_stored(result)
         if result.dead_reason:
             self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
         if is_change(data):  # the table may have changed again since this change was sent
@@ -150,8 +193,8 @@ class BlockRunner:
         return result
 
     def count_block(self, data: bytes) -> None:
-        """Count a block and its samples, and update the lag. Changes of the table are not counted."""
-        if is_change(data):
+        """Count a block and its samples, and update the lag. Other messages are not counted."""
+        if not is_block(data):
             return
         samples, arrival_s = peek_header(data)
         self.blocks += 1

@@ -8,10 +8,10 @@ from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.packs.table_change import trusted_data
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.fleet.worker.raw_messages import trusted_data
 from bms_estimator.fleet.worker.result_publisher import ResultPublisher
 from bms_estimator.fleet.worker.retry import RETRY_S, Attempt
 

@@ -13,7 +13,7 @@ from bms_estimator.edge.block import Block
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.estimator.identified_parameters import current_offset, relative_capacity, relative_series_resistance
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
-from bms_estimator.fleet.worker.edge_clock import last_sample_s
+from bms_estimator.fleet.worker.block_checks import last_sample_s
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, HOURLY_FIELDS, accumulate_hour
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
@@ -158,7 +158,7 @@ def _filter_values(estimator: Estimator) -> dict[str, object]:
     capacity, offset, r_s = (
         relative_capacity(record),
         current_offset(record),
-        relative_series_resistance(record, settings),
+        relative_series_resistance(record, settings, estimator.cell_file_settings),
     )
     values: dict[str, object] = {
         "soc_std": float(weakest_cell_soc_std(f, settings["filter"])),

@@ -3,9 +3,8 @@
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
-from bms_estimator.fleet.worker.checkpoint.cell_layouts import cell_count, cell_layout
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint
-from bms_estimator.fleet.worker.checkpoint.record_layout import RecordWithLayout, dtype_of
+from bms_estimator.fleet.worker.checkpoint.record_layout import RecordWithLayout, cell_count, cell_layout, dtype_of
 from bms_estimator.fleet.worker.pack_state import Fields, UnpackedRecord
 
 if TYPE_CHECKING:

@@ -13,16 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.restore import copy_known_fields
-from bms_estimator.fleet.worker.cell_summary import CELL_SUMS, MAX_CELLS
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
 from bms_estimator.kernels.cells.records import BANK, CELL
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields
+from bms_estimator.pack_model.saved import FIT_SHAPES
 
 Fields = Mapping[str, NDArray[Any]]
 """Fields of a record by name; a nested field is named ``part.field``."""
+MAX_CELLS = 128
+"""Maximum number of cells in series with estimators of single cells."""
 MAX_LOST_BLOCKS = 2**62
 """Limit of the count of lost blocks, so that it cannot overflow."""
 
@@ -52,7 +54,7 @@ DELIVERY = np.dtype(
         ("last_s", "f8"),
         # current hour [hours since 1970]; 0: no block yet
         ("hour", "i8"),
-        # error of the edge's clock in the last block of this hour with an error beyond the limits of ``edge_clock`` [s];
+        # error of the edge's clock in the last block of this hour with an error beyond the limits of ``block_checks`` [s];
         # 0: none
         ("clock_error_s", "f8"),
         # ``PackType.config_digest`` of the settings with which the state was computed
@@ -73,12 +75,39 @@ FLOW = np.dtype(
     align=True,
 )
 """Total charge and energy (``telemetry.charge_energy.ChargeEnergy``) and the sums of ``ChargeEnergyMeter``."""
+PACK_FIT = np.dtype(
+    [
+        # stream sequence number of the message with the fit; 0: none
+        ("sequence", "u8"),
+        # std of the filter's SOC from which on the fit is adopted; infinite: never, for example because it failed
+        ("min_filter_std", "f8"),
+        # 1: the pack was exchanged before the fitted rows
+        ("is_exchanged", "i8"),
+        *((name, "f8", shape) for name, shape in FIT_SHAPES.items()),
+    ],
+    align=True,
+)
+"""Fit of a pack's history (``pack_model.fit.PackFit``), without the fields from which the next fit starts."""
+FIT = np.dtype(
+    [
+        # stream sequence number of the block with the unanswered request for a fit; 0: none
+        ("request", "u8"),
+        # ``elapsed_s`` of the history at the request [s]
+        ("begun_s", "f8"),
+        # fit whose curves the filter uses
+        ("in_force", PACK_FIT),
+        # fit that waits for its adoption
+        ("received", PACK_FIT),
+    ],
+    align=True,
+)
+"""Fits of a pack."""
 PACK_STATE = np.dtype(
     [
         ("delivery", DELIVERY),
         ("flow", FLOW),
         ("hour", HOUR_SUMS),
-        ("cells", CELL_SUMS),
+        ("fit", FIT),
         ("estimator", ESTIMATOR_STATE),
     ],
     align=True,

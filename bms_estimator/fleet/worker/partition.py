@@ -14,20 +14,26 @@ import structlog
 from numpy.typing import NDArray
 
 from bms_estimator.edge.block import Block, BlockError, BlockHeader, decode, decode_header
+from bms_estimator.fleet.fits.messages import decode_result, is_fit
 from bms_estimator.fleet.packs.pack_type import PackType
 from bms_estimator.fleet.packs.table_change import is_change
-from bms_estimator.fleet.worker.block_order import BlockOrder, classify_block, edge_reply, mark_taken, position
+from bms_estimator.fleet.worker.block_checks import Arrival, density_fault
+from bms_estimator.fleet.worker.block_order import (
+    BlockOrder,
+    UnsavedPositions,
+    classify_block,
+    edge_reply,
+    mark_taken,
+    position,
+)
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, LETHAL, BlockResult
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
-from bms_estimator.fleet.worker.density import density_fault
-from bms_estimator.fleet.worker.edge_clock import Arrival
 from bms_estimator.fleet.worker.pack_records import PackRecords
 from bms_estimator.fleet.worker.pack_state import Fields
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources, TableInForce
-from bms_estimator.fleet.worker.unsaved_positions import UnsavedPositions
 from bms_estimator.kernels.cells.records import CELL
 
 log = structlog.get_logger(__name__)
@@ -48,7 +54,7 @@ class Partition:
         sequence: Stream sequence number of the last processed or deferred message; 0: none.
         in_force: Table of packs that is in force at this position of the stream.
         deferred: Queue of packs with deferred messages.
-        clock_errors: Errors of edges' clocks beyond the limits of ``edge_clock``, by pack [s], positive if ahead. A pack is
+        clock_errors: Errors of edges' clocks beyond the limits of ``block_checks``, by pack [s], positive if ahead. A pack is
             listed from a block with an error until the end of this hour on its clock.
     """
 
@@ -170,8 +176,10 @@ class Partition:
             return self._apply_change(pack, data)
         pack_type = self.in_force.look_up(pack)
         if pack_type is None:
-            is_block = isinstance(self._decode(data), Block)
+            is_block = not is_fit(data) and isinstance(self._decode(data), Block)
             return self.defer(pack, sequence) if is_block else BlockResult(pack)
+        if is_fit(data):
+            return self._receive_fit(pack, data, sequence, pack_type)
         return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def defer(self, pack: str, sequence: int) -> BlockResult:
@@ -194,6 +202,8 @@ class Partition:
         self.deferred.advance(pack, sequence)
         if is_change(data):
             return self._apply_change(pack, data)
+        if is_fit(data):
+            return self._receive_fit(pack, data, sequence, pack_type)
         return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def reject_misplaced(self, pack: str, sequence: int) -> BlockResult:
@@ -212,6 +222,22 @@ class Partition:
             self._counters["damaged"] += 1
         else:
             self._counters["table_changes"] += 1
+        return BlockResult(pack)
+
+    def _receive_fit(self, pack: str, data: bytes, sequence: int, pack_type: PackType) -> BlockResult:
+        """Store the result of a fit in the record of its pack, if the pack has requested it."""
+        records = self._records
+        try:
+            result = decode_result(data)
+        except ValueError:
+            self._counters["damaged"] += 1
+            return BlockResult(pack)
+        if records.is_current(pack) and records.load(pack) is None:
+            if self._processor.receive_fit(result, sequence, pack_type):
+                self._unsaved.add(pack, position(records.unpacked.delivery))
+                records.store(pack)
+            else:
+                self._counters["stale_fits"] += 1
         return BlockResult(pack)
 
     def _decode_and_take(
@@ -325,8 +351,7 @@ class Partition:
     ) -> BlockResult | None:
         """Estimate the next block; None after an internal error."""
         try:
-            state, parameters, cells, hours = self._processor.step(pack, block, arrival, pack_type, unmigrated_fields)
-            return BlockResult(pack, state=state, parameters=parameters, cells=cells, hours=hours)
+            return self._processor.step(pack, block, arrival, pack_type, unmigrated_fields)
         except Exception:  # an internal error with one block must not stop the pack
             log.exception("a block is skipped", partition=self.number, pack=pack, number=block.number)
         self._processor.reset_window()

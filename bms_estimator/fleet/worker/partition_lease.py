@@ -18,13 +18,12 @@ from nats.aio.msg import Msg
 
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.worker.block_loop import BlockLoop
+from bms_estimator.fleet.worker.block_loop import SILENCE_S, BlockLoop, DeliveredMessages
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
 from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError
 from bms_estimator.fleet.worker.deferred_reader import DeferredReader
-from bms_estimator.fleet.worker.delivered_messages import SILENCE_S, DeliveredMessages
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.partition_restore import restore_partition
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer

@@ -16,7 +16,7 @@ from nats.aio.msg import Msg
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import GROUP, PIN_S, RESPONSE_TIMEOUT_S, consumer
-from bms_estimator.fleet.packs.table_change import trusted_data
+from bms_estimator.fleet.worker.raw_messages import trusted_data
 
 RENEW_S = PIN_S / 4.0
 """Interval of requests [s]. A pin survives if the event loop is late by three intervals."""

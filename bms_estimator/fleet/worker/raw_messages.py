@@ -7,9 +7,27 @@ from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.fits.messages import is_fit
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
-from bms_estimator.fleet.packs.table_change import trusted_data
+from bms_estimator.fleet.packs.table_change import is_change
+
+
+def is_block(data: bytes) -> bool:
+    """Return True if a message of the stream is neither a change of the table nor a fit."""
+    return not (is_change(data) or is_fit(data))
+
+
+def trusted_data(subject: str, data: bytes) -> bytes:
+    """Return the data of a stored message, or empty data if an edge has sent anything else in place of a block.
+
+    Only workers send changes of the table, and only ``fleet fit`` sends fits. Empty data are rejected as a damaged block.
+
+    Args:
+        subject: Subject under which the stream ``RAW`` stores the message.
+        data: Data of the message.
+    """
+    return b"" if subjects.is_raw(subject) and not is_block(data) else data
 
 
 class RawMessages:

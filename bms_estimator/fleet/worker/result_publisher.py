@@ -1,7 +1,7 @@
 """Publication of the results of one partition.
 
-Estimates and replies are dropped without a connection, because later ones replace them. Hourly summaries and dead letters are
-queued until the server acknowledges them.
+Estimates and replies are dropped without a connection, because later ones replace them. Hourly summaries, messages of histories
+and dead letters are queued until the server acknowledges them.
 """
 
 import asyncio
@@ -12,10 +12,10 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
-from bms_estimator.fleet.worker.block_result import BlockResult
+from bms_estimator.fleet.worker.block_result import BlockResult, HistoryMessage
 
-MAX_PENDING_SUMMARIES = 128
-"""Maximum number of published summaries that wait for the server's acknowledgment."""
+MAX_PENDING = 128
+"""Maximum number of published messages that wait for the server's acknowledgment."""
 
 
 class ResultPublisher:
@@ -25,54 +25,58 @@ class ResultPublisher:
         nc: Connection to the tenant's NATS account.
 
     Attributes:
-        waiting_summaries: Summaries that the server has not acknowledged yet: (message id, pack, row).
+        waiting: Summaries and messages of histories that the server has not acknowledged yet.
         waiting_dead_letters: Dead letters that the server has not acknowledged yet.
         added: Results to be published by ``publish_added``.
     """
 
     def __init__(self, nc: Client) -> None:
         self._nc = nc
-        self.waiting_summaries: deque[tuple[str, str, bytes]] = deque()
+        self.waiting: deque[HistoryMessage] = deque()
         self.waiting_dead_letters: deque[DeadLetter] = deque()
         self.added: list[BlockResult] = []
         self._send_lock = asyncio.Lock()
 
     @property
     def is_waiting(self) -> bool:
-        """True if the server has not acknowledged all summaries and dead letters."""
-        return bool(self.waiting_summaries or self.waiting_dead_letters)
+        """True if the server has not acknowledged all queued messages."""
+        return bool(self.waiting or self.waiting_dead_letters)
 
-    def queue_summaries(self, result: BlockResult) -> None:
-        """Queue the hourly summaries of a result."""
-        self.waiting_summaries.extend((message_id, result.pack, row) for message_id, row in result.hours)
+    def queue_stored(self, result: BlockResult) -> None:
+        """Queue the hourly summaries of a result, and its messages of the history."""
+        subject = subjects.hours(result.pack)
+        self.waiting.extend(HistoryMessage(subject, row, message_id) for message_id, row in result.hours)
+        self.waiting.extend(result.history)
 
     def queue_dead_letter(self, letter: DeadLetter) -> None:
         """Queue a dead letter."""
         self.waiting_dead_letters.append(letter)
 
     def clear(self) -> None:
-        """Drop the queued summaries and dead letters."""
-        self.waiting_summaries.clear()
+        """Drop the queued messages."""
+        self.waiting.clear()
         self.waiting_dead_letters.clear()
 
     async def send_queued(self) -> None:
-        """Publish the queued summaries and dead letters, and await the server's acknowledgment.
+        """Publish the queued messages in their order, and await the server's acknowledgment.
 
         Raises:
             nats.errors.Error: Some were not acknowledged; they remain queued.
         """
         js = self._nc.jetstream()
 
-        async def send(message_id: str, pack: str, row: bytes) -> None:
-            await js.publish(subjects.hours(pack), row, headers={"Nats-Msg-Id": message_id})
-
         async with self._send_lock:
-            while self.waiting_summaries:
-                rows = list(islice(self.waiting_summaries, MAX_PENDING_SUMMARIES))
-                await asyncio.gather(*(send(*row) for row in rows))
-                for row in rows:  # the queue was cleared meanwhile if the ownership was lost
-                    if self.waiting_summaries and self.waiting_summaries[0] is row:
-                        self.waiting_summaries.popleft()
+            while self.waiting:
+                messages = list(islice(self.waiting, MAX_PENDING))
+                await asyncio.gather(
+                    *(
+                        js.publish(each.subject, each.data, headers={"Nats-Msg-Id": each.message_id})
+                        for each in messages
+                    )
+                )
+                for message in messages:  # the queue was cleared meanwhile if the ownership was lost
+                    if self.waiting and self.waiting[0] is message:
+                        self.waiting.popleft()
             while self.waiting_dead_letters:
                 letter = self.waiting_dead_letters[0]
                 await js.publish(letter.subject, letter.data, headers=letter.headers())

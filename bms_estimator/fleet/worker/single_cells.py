@@ -7,8 +7,7 @@ import numpy as np
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.fleet.worker.cell_summary import MAX_CELLS
-from bms_estimator.fleet.worker.pack_state import UnpackedRecord
+from bms_estimator.fleet.worker.pack_state import MAX_CELLS, UnpackedRecord
 from bms_estimator.model.payloads.cells import CellsReport
 from bms_estimator.model.sample import CellBlock
 from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
@@ -89,26 +88,21 @@ class SingleCells:
         deviations = self._deviations
         return None if deviations is None else make_cells_payload(deviations, short_limit_a, now_s)
 
-    def row_fields(self, weakest: int | None) -> dict[str, Any]:
-        """Return the fields of an hourly row; empty without an estimate.
-
-        Args:
-            weakest: Number of the cell with the lowest mean voltage, from 1; None without cell voltages in this hour. Blocks of
-                another number of cells may give a larger number than the pack has.
-        """
+    def row_fields(self) -> dict[str, Any]:
+        """Return the fields of an hourly row; empty without an estimate."""
         d = self._deviations
         if d is None:
             return {}
         leaking = int(np.argmax(d.self_discharge_a / d.self_discharge_std_a))
-        fields: dict[str, Any] = {
+        return {
+            "weakest_cell": d.weakest + 1,
+            "weakest_cell_soc_deviation": float(d.soc_deviation[d.weakest]),
+            "weakest_cell_resistance_ratio": float(d.resistance_ratio[d.weakest]),
+            "cell_soc_spread": float(np.ptp(d.soc_deviation)),
             "self_discharge_cell": leaking + 1,
             "self_discharge_a": float(d.self_discharge_a[leaking]),
             "self_discharge_std_a": float(d.self_discharge_std_a[leaking]),
         }
-        if weakest is not None and weakest <= d.soc.size:
-            fields["weakest_cell_soc_deviation"] = float(d.soc_deviation[weakest - 1])
-            fields["weakest_cell_resistance_ratio"] = float(d.resistance_ratio[weakest - 1])
-        return fields
 
     @property
     def _deviations(self) -> CellDeviations | None:

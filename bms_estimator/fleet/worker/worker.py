@@ -5,30 +5,64 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
+from nats.js.errors import NotFoundError
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
 from bms_estimator.fleet.nats.connection import close, connect, error_text
+from bms_estimator.fleet.nats.streams import require_partitions
+from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.block_loop import BlockLoop
-from bms_estimator.fleet.worker.heartbeat_report import HeartbeatReport
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
+from bms_estimator.fleet.worker.heartbeats import HeartbeatReport, Membership
 from bms_estimator.fleet.worker.lease_tasks import LeaseTasks
-from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
-from bms_estimator.fleet.worker.periodic_storage import PeriodicStorage
+from bms_estimator.fleet.worker.periodic_tasks import PeriodicStorage, UnknownPacks, UnsavedCheck, check_refused
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
-from bms_estimator.fleet.worker.refused_check import check_refused
 from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
-from bms_estimator.fleet.worker.tenant_stores import TenantStores, open_stores
-from bms_estimator.fleet.worker.unknown_packs import UnknownPacks
-from bms_estimator.fleet.worker.unsaved_check import UnsavedCheck
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import end, until_first_ends
+
+
+class TenantStores(NamedTuple):
+    """Stores of a tenant."""
+
+    partitions: int
+    """Total number of partitions."""
+    checkpoints: CheckpointStore
+    bucket: PackBucket
+    """Table of packs."""
+
+
+async def open_stores(nc: Client, worker: str) -> TenantStores:
+    """Open the buckets and read the table of packs.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+        worker: Name of the worker.
+
+    Raises:
+        UserError: A stream is missing.
+    """
+    partitions = await require_partitions(nc)
+    try:
+        await nc.jetstream().stream_info(subjects.FITS_STREAM)
+    except NotFoundError:
+        raise UserError(
+            f"the server has no stream {subjects.FITS_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
+        ) from None
+    checkpoints = await open_checkpoints(nc, worker)
+    bucket = PackBucket(nc)
+    await bucket.refresh()
+    return TenantStores(partitions, checkpoints, bucket)
+
 
 CHECKPOINT_S = 300.0
 """Default interval between two checkpoints of a partition [s]."""

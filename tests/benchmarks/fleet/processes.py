@@ -85,6 +85,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--warm-up", type=float, default=2.0, help="time before the measurement [min]")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--speed", type=float, default=1.0, help="speed of the packs relative to real time")
+    parser.add_argument("--fits", action="store_true", help="run also `fleet fit`")
     parser.add_argument("--json", type=Path, help="file to which the rows are also written")
     return parser.parse_args()
 
@@ -109,10 +110,13 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
     begin = datetime.fromtimestamp(begin_s, UTC).replace(tzinfo=None).isoformat()
     blocks = round(minutes * arguments.speed) + 1
     edges = fleet_rig.simulate(packs, seed=SEED, begin=f"{begin}", speed=arguments.speed, blocks=blocks)
+    fits = [fleet_rig.start_fits()] if arguments.fits else []
     await asyncio.sleep(60.0 * arguments.warm_up)
-    pids = {"server": fleet_rig.engine.pid(0), "edges": edges.pid} | {
-        name: fleet_rig.workers[name].pid for name in names
-    }
+    pids = (
+        {name: fleet_rig.workers[name].pid for name in fits}
+        | {"server": fleet_rig.engine.pid(0), "edges": edges.pid}
+        | {name: fleet_rig.workers[name].pid for name in names}
+    )
     cpu_before_s = {name: cpu_s(pid) for name, pid in pids.items()}
     idle_before_s = psutil.cpu_times().idle
     measure_begin_s, blocks_before = time.monotonic(), received.blocks
@@ -145,6 +149,8 @@ async def _run(fleet_rig: Rig, packs: int, arguments: argparse.Namespace) -> dic
         "workers, CPU, cores": f"{workers_cpu_s / elapsed_s:.3f}",
         "server, CPU, cores": f"{cpu_time_s['server'] / elapsed_s:.3f}",
         "edges simulated, CPU, cores": f"{cpu_time_s['edges'] / elapsed_s:.3f}",
+        "fits, CPU, cores": f"{sum(cpu_time_s[name] for name in fits) / elapsed_s:.3f}",
+        "fits, late fits": f"{received.total('fits')}, {received.total('late_fits')}",
         "spare cores": f"{idle_s / elapsed_s:.2f}",
         "workers, CPU per block, ms": f"{1e3 * workers_cpu_s / max(1, processed_blocks):.3f}",
         "server, CPU per block, ms": f"{1e3 * cpu_time_s['server'] / max(1, processed_blocks):.3f}",

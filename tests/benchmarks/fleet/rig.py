@@ -39,6 +39,11 @@ class Rig:
         self.workers[name] = self.run("worker", *arguments, log=name)
         return name
 
+    def start_fits(self) -> str:
+        """Start ``fleet fit``, and return the name of the process, which ends with the workers."""
+        self.workers["fit"] = self.run("fit", "--server", self.server, log="fit")
+        return "fit"
+
     def stop_workers(self) -> None:
         """Stop the workers by SIGTERM, so that each writes its checkpoints."""
         for process in self.workers.values():
@@ -98,9 +103,10 @@ async def create_streams(rig: Rig, *, partitions: int) -> None:
 
 
 def cpu_s(pid: int) -> float:
-    """Return the CPU time of a process [s]."""
-    times = psutil.Process(pid).cpu_times()
-    return times.user + times.system
+    """Return the CPU time of a process and of its children [s]."""
+    process = psutil.Process(pid)
+    times = [each.cpu_times() for each in (process, *process.children(recursive=True))]
+    return sum(each.user + each.system for each in times)
 
 
 def rss_mib(pid: int) -> float:

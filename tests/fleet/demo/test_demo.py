@@ -22,7 +22,7 @@ def test_demo_names_faulty_packs_and_loses_no_block_when_a_worker_is_killed() ->
     assert "page http://127.0.0.1:" in output
     assert "dead letter: version 4; this program reads versions 1 to 3" in output
     assert "report it 13." in output
-    assert "names cell 7: it is 60 mV below the mean" in output
+    assert "names cell 7: its SOC is 6 % below the mean" in output
     assert "ada is killed (kill -9)" in output
     assert "bob owns all partitions" in output
     assert "undecodable blocks (dead letters) 1 lost blocks 0 takeover" in output

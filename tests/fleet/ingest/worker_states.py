@@ -12,6 +12,7 @@ from bms_estimator.fleet.worker.worker import Options, work
 from bms_estimator.model.sample import SampleBlock
 from tests.fleet.ingest.platform import START_S
 from tests.fleet.nats_cluster import connected
+from tests.fleet.partition_stream import estimates_of
 from tests.fleet.workers import Heartbeats, end_states, record_of_run
 
 PARTITIONS = 2
@@ -39,7 +40,7 @@ async def states(nc: Client, registry: PackRegistry, *packs: str) -> list[bytes]
     """Return the records of the packs' estimators from the last checkpoints."""
     partitions = await end_states(nc, registry, PARTITIONS)
     found = [partitions[subjects.partition_of(pack, PARTITIONS)].state(pack) for pack in packs]
-    return [state["estimator"].tobytes() for state in found if state is not None]
+    return [estimates_of(state["estimator"]) for state in found if state is not None]
 
 
 def of_one_run(registry: PackRegistry, pack: str, rows: SampleBlock) -> bytes:

@@ -6,6 +6,7 @@ from bms_estimator.fleet.packs.csv_table import check_models, read_table, table_
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK, PackRegistry
 from bms_estimator.fleet.packs.pack_row import (
     COLUMNS,
+    FIT_INTERVAL_S,
     PackRow,
     PackSpec,
     decode_row,
@@ -160,7 +161,7 @@ def test_limits_and_uncertainties_of_a_row_are_those_of_a_pack_file(write_table)
     path = write_table(f"pack,cell,capacity_ah,series,{header}\nhouse,lfp,280,16,{row}\n")
     settings = settings_of(read_table(path).packs["house"].spec)
     assert settings.charge_limits == ChargeLimits(**pack)
-    assert settings.identifier == IdentifierSettings(**identifier, pack_model=False)
+    assert settings.identifier == IdentifierSettings(**identifier, fit_interval_s=FIT_INTERVAL_S)
 
 
 def test_full_voltage_below_the_cutoff_voltage_is_reported_as_in_a_pack_file(write_table):

@@ -14,12 +14,19 @@ from bms_estimator.fleet.queries.parquet_files import write
 from tests.command_line import run
 from tests.fleet.hour_rows import BEGIN, make_hour
 from tests.fleet.nats_cluster import connected, running
+from tests.fleet.partition_stream import estimates_of
 from tests.fleet.workers import STORE_ID_NS, Heartbeats, Process, end_states, estimated, load_packs, samples, send
 from tests.patience import LONG_S
 
 BLOCKS = 8
 """Number of blocks of each pack, which last 80 minutes."""
-STREAMS = (subjects.RAW_STREAM, subjects.HOURS_STREAM, f"OBJ_{subjects.STATES_BUCKET}")
+STREAMS = (
+    subjects.RAW_STREAM,
+    subjects.HOURS_STREAM,
+    subjects.HISTORY_STREAM,
+    subjects.FITS_STREAM,
+    f"OBJ_{subjects.STATES_BUCKET}",
+)
 
 
 def block(pack, number):
@@ -74,7 +81,7 @@ async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_p
         partition = (await end_states(nc, registry, 1))[0]
         assert partition.state("p1") is None
         state = partition.state("p2")
-        assert state["estimator"].tobytes() == estimated(registry, "p2", BLOCKS)
+        assert estimates_of(state["estimator"]) == estimated(registry, "p2", BLOCKS)
         await nc.close()
         cluster.kill(0)
         assert files_with(tmp_path, subjects.stored_raw(0, "p2"))
@@ -117,7 +124,7 @@ async def test_pack_that_is_added_again_after_its_erasure_begins_anew(tmp_path, 
         finally:
             worker.kill()
         state = (await end_states(nc, registry, 1))[0].state("p1")
-        assert state["estimator"].tobytes() == estimated(registry, "p1", BLOCKS - 1)
+        assert estimates_of(state["estimator"]) == estimated(registry, "p1", BLOCKS - 1)
         hours = (await nc.jetstream().stream_info(subjects.HOURS_STREAM, subjects_filter=subjects.hours("p1"))).state
         assert hours.subjects == {subjects.hours("p1"): 1}
         await nc.close()

@@ -26,9 +26,9 @@ from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_server import serve as serve_node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
-from bms_estimator.fleet.server.server_binary import find_server
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.nats_server_program import find_server
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from tests.command_line import run
 from tests.fleet.serve_process import ServeProcess
@@ -317,9 +317,9 @@ def test_missing_certificate_or_another_key_is_rejected(
 @pytest.mark.parametrize(
     ("text", "expected_code", "reason"),
     [
-        ("packs = 10_000_000\noutage_days = 365", 75, "streams: the streams need 4540680.0 GB, but may use only "),
-        ("packs = 10_000_000\ndisk_gb = 1e6", 75, "streams: the streams need 94320.0 GB, but may use only "),
-        ("packs = 10_000\ndisk_gb = 90", 2, "server.disk_gb = 90: the streams need 94.3 GB: increase disk_gb"),
+        ("packs = 10_000_000\noutage_days = 365", 75, "streams: the streams need 4552780.0 GB, but may use only "),
+        ("packs = 10_000_000\ndisk_gb = 1e6", 75, "streams: the streams need 106420.0 GB, but may use only "),
+        ("packs = 10_000\ndisk_gb = 90", 2, "server.disk_gb = 90: the streams need 106.4 GB: increase disk_gb"),
     ],
 )
 def test_server_refuses_to_start_if_the_streams_do_not_fit(

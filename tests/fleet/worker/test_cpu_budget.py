@@ -2,8 +2,8 @@
 
 import pytest
 
-from bms_estimator.fleet.worker import cpu_budget
-from bms_estimator.fleet.worker.cpu_budget import BURST_S, MAX_CHARGE_S, MAX_CPU_FRACTION, CpuBudget
+from bms_estimator.fleet.worker import block_runner
+from bms_estimator.fleet.worker.block_runner import BURST_S, MAX_CHARGE_S, MAX_CPU_FRACTION, CpuBudget
 
 CHARGES = round(BURST_S / MAX_CHARGE_S) + 1
 """Number of maximum charges that exhaust a budget."""
@@ -41,11 +41,11 @@ def test_source_at_1000_hz_stays_within_its_budget() -> None:
 
 
 def test_number_of_stored_packs_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cpu_budget, "MAX_PACKS", 10)
+    monkeypatch.setattr(block_runner, "MAX_PACKS", 10)
     clock = ManualClock()
     budget = CpuBudget(clock)
     for number in range(100):
         clock.now_s += 1.0
         budget.charge(f"p{number}", 0.01)
     # besides the limit, the pack that was charged last is stored
-    assert len(budget._levels) <= cpu_budget.MAX_PACKS + 1
+    assert len(budget._levels) <= block_runner.MAX_PACKS + 1

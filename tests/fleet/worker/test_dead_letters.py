@@ -15,6 +15,7 @@ from bms_estimator.fleet.worker.block_result import LETHAL
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.command_line import PROGRAM, run, running_program
 from tests.fleet.nats_cluster import NatsCluster
+from tests.fleet.partition_stream import estimates_of
 from tests.fleet.worker import later_blocks, lethal_block
 from tests.fleet.worker.later_blocks import later_block
 from tests.fleet.workers import (
@@ -64,10 +65,10 @@ async def test_block_that_kills_its_workers_is_skipped_and_stored_as_a_dead_lett
     code, out = await fleet(cluster, "dead-letters", "list")
     assert (code, f"{letter.sequence}" in out, LETHAL in out) == (0, True, True)
     partition = (await end_states(nc, registry, 1))[0]
-    assert partition.state("p2")["estimator"].tobytes() == estimated(registry, "p2", 3)
+    assert estimates_of(partition.state("p2")["estimator"]) == estimated(registry, "p2", 3)
     estimator = make_estimator(*registry("p1"))
     estimator.run(np.concatenate([samples("p1", number) for number in (1, 3)]))
-    assert partition.state("p1")["estimator"].tobytes() == estimator.record.tobytes()
+    assert estimates_of(partition.state("p1")["estimator"]) == estimates_of(estimator.record)
 
 
 @pytest.mark.thorough
@@ -98,7 +99,7 @@ async def test_blocks_of_a_later_version_are_processed_by_a_replay_after_the_upg
         new.kill()
     assert await read_dead_letters(nc) == []
     partition = (await end_states(nc, registry, 1))[0]
-    assert partition.state("p1")["estimator"].tobytes() == estimated(registry, "p1", 2)
+    assert estimates_of(partition.state("p1")["estimator"]) == estimated(registry, "p1", 2)
 
 
 async def test_block_that_cannot_be_decoded_is_stored_as_a_dead_letter_and_can_be_replayed(

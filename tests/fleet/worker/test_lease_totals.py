@@ -2,7 +2,7 @@
 
 from collections import Counter
 
-from bms_estimator.fleet.worker.lease_totals import SourceSum
+from bms_estimator.fleet.worker.lease_tasks import SourceSum
 
 
 def test_total_does_not_fall_when_a_source_disappears_and_counts_each_source_once():

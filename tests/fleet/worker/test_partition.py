@@ -29,7 +29,17 @@ from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.sources.captures.replay import Replay
 from tests.estimator.simulated_cell import pulses
-from tests.fleet.partition_stream import CELL, SETTINGS, STORE_ID_NS, Stream, blocks_of, deliver, one_block, table
+from tests.fleet.partition_stream import (
+    CELL,
+    SETTINGS,
+    STORE_ID_NS,
+    Stream,
+    blocks_of,
+    deliver,
+    estimates_of,
+    one_block,
+    table,
+)
 
 HOUR_NS = 3600 * 10**9
 
@@ -55,7 +65,7 @@ def assert_state_equals(stream: Stream, pack: str, record) -> None:
     """Check that the estimator's record of a pack equals ``record`` bit for bit."""
     state = stream.partition.state(pack)
     assert state is not None
-    assert state["estimator"].tobytes() == record.tobytes()
+    assert estimates_of(state["estimator"]) == estimates_of(record)
 
 
 def test_duplicates_gaps_resends_and_a_takeover_after_each_message_give_the_state_of_one_run(stream, samples) -> None:

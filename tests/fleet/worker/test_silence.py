@@ -19,6 +19,7 @@ from bms_estimator.fleet.worker.table_in_force import PackLookup
 from bms_estimator.fleet.worker.worker import Options, work
 from bms_estimator.process.tasks import end, until_first_ends
 from tests.fleet.nats_cluster import running
+from tests.fleet.partition_stream import estimates_of
 from tests.fleet.workers import Heartbeats, block, end_states, estimated, load_packs, send, until
 
 PARTITIONS = 4
@@ -54,7 +55,7 @@ async def test_messages_delivered_to_a_dead_worker_are_processed_without_further
             partition = states[subjects.partition_of(pack, PARTITIONS)]
             state = partition.state(pack)
             assert state is not None
-            assert state["estimator"].tobytes() == estimated(registry, pack, BLOCKS)
+            assert estimates_of(state["estimator"]) == estimated(registry, pack, BLOCKS)
             assert partition.counters["blocks"] == BLOCKS * _pack_count(partition.number)
         await nc.close()
 
@@ -103,7 +104,7 @@ async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_t
         for pack in PACKS:
             state = lease.partition.state(pack)
             assert state is not None
-            assert state["estimator"].tobytes() == estimated(registry, pack, 1)
+            assert estimates_of(state["estimator"]) == estimated(registry, pack, 1)
         await end(running_lease)
         await nc.close()
 

@@ -1,4 +1,4 @@
-"""Workers and server nodes that are killed while simulated edges send: no block is lost or counted twice.
+"""Workers and server nodes that are killed while simulated edges send and packs are fitted: no block is lost or counted twice.
 
 ``make fleet-kills`` sets the numbers of kills, nodes and packs by ``KILLS``, ``NODES`` and ``PACKS``.
 """
@@ -12,16 +12,15 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, aclosing
 from pathlib import Path
 
-import numpy as np
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
-from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.packs.pack_bucket import PackBucket, write_bucket
@@ -29,11 +28,11 @@ from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.simulation.block_publisher import run_edges
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
-from bms_estimator.fleet.worker.membership import assign_partitions
+from bms_estimator.fleet.worker.heartbeats import assign_partitions
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, connected, running
-from tests.fleet.workers import Heartbeats, Process, end_states
+from tests.fleet.workers import Fitter, Heartbeats, Process, end_states
 from tests.patience import LONG_S
 
 KILLS, NODES, PACKS, SEED = (
@@ -46,14 +45,14 @@ MEAN_UPTIME_S = 1.0
 """Mean time from the restart after a kill to the next kill [s]."""
 MAX_DOWNTIME_S = 2.0
 """Maximum delay of the restart after a kill [s]."""
-BLOCKS_AFTER_KILLS = 5
+BLOCKS_AFTER_KILLS = 40
 """Number of blocks of each edge after the last kill.
 
-They are needed because a worker requests a missing block when the next one arrives.
+They are needed because a worker requests a missing block when the next one arrives, and a fit when the pack is half an hour old.
 """
 
 
-async def test_states_and_hour_rows_after_kills_are_those_of_one_run(tmp_path: Path) -> None:
+async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_stream(tmp_path: Path) -> None:
     with running(tmp_path, NODES, partitions=PARTITIONS) as cluster, ExitStack() as stack:
         nc = await connected(cluster.urls)
         await make_streams(nc, partitions=PARTITIONS, replicas=NODES)
@@ -74,6 +73,8 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run(tmp_path: P
 
         start_worker()
         start_worker()
+        fitter = Fitter(tmp_path, ",".join(cluster.urls))
+        stack.callback(fitter.kill)
         speed = BLOCKS_PER_S * BLOCK_S / PACKS  # simulated seconds per second
         edges, stop = SimulatedEdges(fleet, start_s=time.time(), speed=speed), asyncio.Event()
         settings = MqttSettings(url=tuple(f"mqtt://127.0.0.1:{port}" for port in cluster.mqtt_ports))
@@ -110,15 +111,16 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run(tmp_path: P
         sys.stdout.write(f"{NODES} nodes, kills: {dict(kills)}; {await publisher_task}\n")
         assert [await worker.end() for worker in workers.values()] == [0, 0]
         states = await end_states(nc, bucket.packs, PARTITIONS)
-        for i, pack in enumerate(fleet.names):
-            state = states[subjects.partition_of(pack, PARTITIONS)].state(pack)
-            assert state is not None
+        expected, expected_rows = await run_over_the_stream(nc, bucket.packs)
+        for pack in fleet.names:
+            number = subjects.partition_of(pack, PARTITIONS)
+            state, expected_state = states[number].state(pack), expected[number].state(pack)
             assert (state["delivery"]["awaited"][0], state["delivery"]["lost_blocks"][0]) == (edges.last + 1, 0)
-            estimator = make_estimator(*bucket.packs(pack))
-            for samples in fleet.samples(np.full(edges.last, i), np.arange(1, edges.last + 1)):
-                estimator.run(samples)
-            assert state["estimator"].tobytes() == estimator.record.tobytes()
-        assert await stored_hours(nc) == expected_hours(bucket.packs, fleet, edges)
+            assert state["estimator"].tobytes() == expected_state["estimator"].tobytes()
+            assert state["fit"].tobytes() == expected_state["fit"].tobytes()
+        fits = sum(partition.counters.get("fits", 0) for partition in expected.values())
+        sys.stdout.write(f"{fits} fits of {PACKS} packs\n")
+        assert await stored_hours(nc) == expected_rows
         await nc.close()
 
 
@@ -157,16 +159,16 @@ def without_arrival(data: bytes) -> dict[str, bytes]:
     return {f"{row.pack}.{row.hour}": row.model_dump_json().encode()}
 
 
-def expected_hours(registry: PackRegistry, fleet: SimulatedFleet, edges: SimulatedEdges) -> dict[str, bytes]:
-    """Return the hour rows of one partition that processes all blocks in order."""
-    partition, packs = Partition(0, registry), np.arange(PACKS)
-    rows = {}
-    for number in range(1, edges.last + 1):
-        numbers = np.full(PACKS, number)
-        for i, data in enumerate(fleet.blocks(packs, numbers, edges._ready_s(numbers))):
-            for _, row in partition.take(fleet.names[i], data, partition.sequence + 1).hours:
-                rows |= without_arrival(row)
-    return rows
+async def run_over_the_stream(nc: Client, registry: PackRegistry) -> tuple[dict[int, Partition], dict[str, bytes]]:
+    """Return the partitions of one worker that processes all messages of the stream in order, and their hour rows."""
+    partitions, rows = {number: Partition(number, registry) for number in range(PARTITIONS)}, dict[str, bytes]()
+    async with aclosing(read_stream(nc, subjects.RAW_STREAM, "p.>")) as batches:
+        async for batch in batches:
+            for message in batch:
+                _, number, _, pack = message.subject.split(".")
+                for _, row in partitions[int(number)].take(pack, message.data, message.sequence).hours:
+                    rows |= without_arrival(row)
+    return partitions, rows
 
 
 def test_partitions_are_shared_evenly_and_few_move_when_a_worker_joins() -> None:

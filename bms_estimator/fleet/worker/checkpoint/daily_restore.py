@@ -13,7 +13,7 @@ from bms_estimator.fleet.nats.streams import require_partitions
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
-from bms_estimator.fleet.worker.checkpoint.fenced_change import change_checkpoints
+from bms_estimator.fleet.worker.checkpoint.claims import change_checkpoints
 from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError
 from bms_estimator.model.errors import UserError
 

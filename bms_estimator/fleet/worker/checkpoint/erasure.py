@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S, require_partiti
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
-from bms_estimator.fleet.worker.checkpoint.fenced_change import change_checkpoints
+from bms_estimator.fleet.worker.checkpoint.claims import change_checkpoints
 from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError, UnreadableFormatError
 from bms_estimator.model.errors import UserError
 
@@ -77,10 +77,13 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
         members = {pack for pack in packs if subjects.partition_of(pack, partitions) == number}
         for pack in members:
             blocks[pack] = await erase_messages(nc, subjects.RAW_STREAM, subjects.stored_raw(number, pack))
-            await erase_messages(nc, subjects.RAW_STREAM, subjects.stored(number, pack))  # changes of its row
+            await erase_messages(nc, subjects.RAW_STREAM, subjects.stored(number, pack))  # changes of its row, fits
         checkpoints |= await _erase_states(nc, store, number, members)
     dead_letters = {pack: await erase_messages(nc, subjects.DEAD_STREAM, subjects.dead(pack)) for pack in packs}
     hours = {pack: await erase_messages(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
+    for pack in packs:
+        await nc.jetstream().purge_stream(subjects.FITS_STREAM, subject=subjects.fit_request(pack))
+        await erase_messages(nc, subjects.HISTORY_STREAM, subjects.history(pack))
     remaining = await _remaining(nc, packs)
     return {
         pack: Erasure(blocks[pack], dead_letters[pack], checkpoints[pack], hours[pack], remaining[pack])
@@ -188,6 +191,8 @@ def _pack_subjects(stream: str, pack: str) -> list[str]:
         subjects.RAW_STREAM: [f"p.*.*.{pack}"],
         subjects.HOURS_STREAM: [subjects.hours(pack)],
         subjects.DEAD_STREAM: [subjects.dead(pack)],
+        subjects.HISTORY_STREAM: [subjects.history(pack)],
+        subjects.FITS_STREAM: [subjects.fit_request(pack)],
         f"KV_{subjects.PACKS_BUCKET}": [f"$KV.{subjects.PACKS_BUCKET}.{pack}"],
         f"KV_{subjects.CELLS_BUCKET}": [],
         f"KV_{subjects.CHECKPOINTS_BUCKET}": [],

@@ -1,14 +1,18 @@
 """Layout of a pack's record in a checkpoint: the names, types and order of its fields.
 
 A version with other fields can therefore restore the record by the names of its fields.
+
+Records with single cells have a layout for each number of cells. An earlier version reads such a record by the names of its
+fields, and drops the single cells.
 """
 
 import json
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bms_estimator.fleet.worker.pack_state import PACK_STATE
+from bms_estimator.fleet.worker.pack_state import CELLS, MAX_CELLS, PACK_STATE, pack_dtype
 from bms_estimator.kernels.packed_record import symmetry_map
 
 _MAX_RECORD_BYTES = 1 << 24
@@ -58,3 +62,17 @@ def _dtype_fields(layout: Any) -> list[Any]:
 
 CURRENT_LAYOUT = layout_of(PACK_STATE)
 """Layout of a pack's record in this version."""
+
+
+@lru_cache(maxsize=MAX_CELLS)
+def cell_layout(cells: int) -> str:
+    """Return the layout of a record with ``cells`` single cells."""
+    return layout_of(pack_dtype(cells))
+
+
+@lru_cache(maxsize=2 * MAX_CELLS)
+def cell_count(layout: str) -> int:
+    """Return the number of single cells of this version's records with this layout; 0 for any other layout."""
+    fields = {name: shape for name, _, shape in json.loads(layout)}
+    (cells,) = fields.get(CELLS) or (0,)
+    return cells if 0 < cells <= MAX_CELLS and cell_layout(cells) == layout else 0

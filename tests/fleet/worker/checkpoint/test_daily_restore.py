@@ -16,6 +16,7 @@ from bms_estimator.fleet.worker.worker import Options, work
 from tests.command_line import run
 from tests.fleet.checkpoints import DAY_S, Clock, damage, raw
 from tests.fleet.nats_cluster import NatsCluster
+from tests.fleet.partition_stream import estimates_of
 from tests.fleet.workers import STORE_ID_NS, Heartbeats, block, end_states, estimated, load_packs, samples, send
 
 DAY = "2026-09-21"
@@ -51,7 +52,7 @@ async def state_of(nc: Client, registry: PackRegistry) -> bytes:
     """Return the estimator's state of the pack p1 in the last checkpoint."""
     state = (await end_states(nc, registry, 1))[0].state("p1")
     assert state is not None
-    return state["estimator"].tobytes()
+    return estimates_of(state["estimator"])
 
 
 async def save_two_days(
@@ -113,7 +114,7 @@ async def test_later_blocks_are_skipped_if_desired_although_a_worker_holds_the_p
         assert heartbeats.last["w"].counters["lost_blocks"] == 2
     estimator = make_estimator(*registry("p1"))
     estimator.run(np.concatenate([samples("p1", number) for number in (1, 2, 5)]))
-    assert await state_of(nc, registry) == estimator.record.tobytes()
+    assert await state_of(nc, registry) == estimates_of(estimator.record)
 
 
 async def test_nothing_is_changed_without_a_readable_checkpoint_of_the_day(nc, cluster, store, clock, capsys) -> None:

@@ -14,11 +14,12 @@ from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
+    MAX_INCREMENT_FRACTION,
+    MAX_INCREMENTS,
     CheckpointStore,
     open_checkpoints,
 )
 from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
-from bms_estimator.fleet.worker.checkpoint.increment import MAX_INCREMENT_FRACTION, MAX_INCREMENTS
 from bms_estimator.fleet.worker.partition import Partition
 from tests.estimator.simulated_cell import pulses
 from tests.fleet.checkpoints import DAY_S, Clock, damage, load, stored_objects

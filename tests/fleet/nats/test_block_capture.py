@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.fleet.identification.block_capture import BlockCapture
+from bms_estimator.fleet.nats.block_capture import BlockCapture
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
 
 STORE_ID_NS = 1_700_000_000 * 10**9

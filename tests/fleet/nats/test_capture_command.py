@@ -17,8 +17,9 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.sources.captures.replay import Replay, load_capture, open_capture
 from tests.command_line import run
-from tests.fleet.identification.test_block_capture import STORE_ID_NS, encoded_block, samples
+from tests.fleet.nats.test_block_capture import STORE_ID_NS, encoded_block, samples
 from tests.fleet.nats_cluster import running
+from tests.fleet.partition_stream import estimates_of
 from tests.fleet.worker.test_single_cells import MODEL, SETTINGS, minutes, table
 from tests.patience import LONG_S
 
@@ -93,4 +94,4 @@ async def test_replay_of_captured_cell_voltages_gives_the_states_of_the_worker_b
     for sequence, data in enumerate(CELL_BLOCKS, 1):
         partition.take("cells", data, sequence)
     assert partition.cells("cells").tobytes() == cells.cells.tobytes()
-    assert partition.state("cells")["estimator"].tobytes() == estimator.record.tobytes()
+    assert estimates_of(partition.state("cells")["estimator"]) == estimates_of(estimator.record)

@@ -1,0 +1,1 @@
+"""Fits of the packs' models to their histories, outside of the workers."""

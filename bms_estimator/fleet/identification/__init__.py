@@ -1,1 +1,0 @@
-"""Re-identification of cells from captured blocks."""

@@ -1,0 +1,173 @@
+"""Fits of the packs of one partition: rows of their histories, requests for fits, and adoption of the results.
+
+A pack requests a fit when ``SlowFit`` would begin one, and adopts the result ``ADOPT_DELAY_S`` later on the clock of its samples. A
+result that arrives later is adopted at the next sample. Results are messages of the partition's stream, so that each worker
+adopts them at the same sample.
+"""
+
+import math
+from collections import Counter
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.edge import subjects
+from bms_estimator.fleet.fits.messages import FitRequest, FitResult, Rows, RowsPosition, encode_rows
+from bms_estimator.fleet.packs.pack_type import Bytes, PackType, bytes_of
+from bms_estimator.fleet.worker.block_result import HistoryMessage
+from bms_estimator.fleet.worker.pack_state import PACK_FIT
+from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, FREE_ROWS, HISTORY_ROW
+from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.pack_model.handover import adopt_curves
+from bms_estimator.pack_model.learning import ADOPT_DELAY_S, SlowFit, fit_interval
+from bms_estimator.pack_model.saved import curve_arrays, fit_of_curves
+
+MAX_CACHED_CURVES = 4096
+"""Maximum number of packs of a partition whose curves are cached [13 kB each]. Other curves are computed with each block."""
+FULL_ROWS = COMPLETED_ROWS - FREE_ROWS
+"""Number of completed rows at which the kernel returns, so that they are taken."""
+
+
+class PackFits:
+    """Fits of the pack whose record is loaded.
+
+    Args:
+        record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
+        counters: Counters of the partition; updated.
+    """
+
+    def __init__(self, record: NDArray[np.void], counters: Counter[str]) -> None:
+        self._fit, self._h = record[0]["fit"], record[0]["estimator"]["history"]
+        self._filter = record[0]["estimator"]["filter"]
+        self._counters = counters
+        self._curves = lru_cache(MAX_CACHED_CURVES)(self._compute_curves)
+        self._pack, self._sequence = "", 0
+        self._messages: list[HistoryMessage] = []
+
+    def use_curves(self, pack: str, pack_type: PackType) -> None:
+        """Write the pack's curves in force to the settings of its estimator, which other packs share."""
+        fit, settings = self._fit["in_force"], pack_type.cell_file_bytes
+        if sequence := int(fit["sequence"]):
+            settings = self._curves(pack, pack_type, sequence, float(fit["elapsed_s"]))
+        pack_type.filter_bytes[...] = settings
+
+    def _compute_curves(self, _pack: str, pack_type: PackType, *_fit: float) -> Bytes:
+        """Return the settings of the filter with the curves of the fit in force. The other arguments identify the fit."""
+        settings = pack_type.estimator.cell_file_settings.copy()
+        adopt_curves(settings, pack_type.estimator.cell_file_settings, fit_of_record(self._fit["in_force"]))
+        return bytes_of(settings)
+
+    def begin_block(self, pack: str, pack_type: PackType, sequence: int) -> None:
+        """Begin a block of the loaded pack.
+
+        Args:
+            pack: Name of the pack.
+            pack_type: Type of the pack.
+            sequence: Stream sequence number of the block.
+        """
+        self._pack, self._sequence, self._messages = pack, sequence, []
+        if pack_type.slow_fit and not self._h["enabled"]:
+            self._h["enabled"] = 1
+            self._h["event_s"] = self._h["elapsed_s"] + pack_type.slow_fit.interval()
+
+    def restart(self) -> None:
+        """Drop a request, because the pack's settings have changed. The next block begins a new interval."""
+        self._fit["request"], self._fit["received"], self._h["enabled"] = 0, np.zeros((), PACK_FIT), 0
+
+    def advance(self, pack_type: PackType) -> None:
+        """Take completed rows, and request or adopt a fit that is due. Call it each time ``Estimator.run_part`` returns."""
+        h, slow_fit = self._h, pack_type.slow_fit
+        if slow_fit is None:
+            return
+        if h["elapsed_s"] >= h["event_s"]:
+            self._handle_event(pack_type, slow_fit)
+        elif h["count"] >= FULL_ROWS:
+            self._send_rows(pack_type)
+
+    def take_messages(self) -> tuple[HistoryMessage, ...]:
+        """Return the messages of the block."""
+        return tuple(self._messages)
+
+    def receive(self, result: FitResult, sequence: int, pack_type: PackType) -> bool:
+        """Process the result of a fit. Return True if the loaded pack has requested it.
+
+        Args:
+            result: The result.
+            sequence: Stream sequence number of its message.
+            pack_type: Type of the pack.
+        """
+        fit, h = self._fit, self._h
+        if pack_type.slow_fit is None or fit["request"] != result.request:
+            return False
+        if not result.is_fitted:
+            fit["request"] = 0
+            h["event_s"] = fit["begun_s"] + fit_interval(float(fit["begun_s"]), pack_type.fit_interval_s)
+            return True
+        write_fit(fit["received"], result, sequence)
+        if h["event_s"] > fit["begun_s"] + ADOPT_DELAY_S:
+            h["event_s"] = h["elapsed_s"]  # it is late: adopt it at the next sample
+        return True
+
+    def _handle_event(self, pack_type: PackType, slow_fit: SlowFit) -> None:
+        """Adopt the received fit, or request a fit if there is no request, or one that was not answered for an interval."""
+        fit, h = self._fit, self._h
+        due_s = fit["begun_s"] + ADOPT_DELAY_S
+        if fit["received"]["sequence"]:
+            self._adopt(slow_fit)
+            fit["request"], fit["received"] = 0, np.zeros((), PACK_FIT)
+            h["event_s"] = due_s + (slow_fit.interval() - ADOPT_DELAY_S)
+        elif fit["request"] and h["event_s"] == due_s:
+            self._counters["late_fits"] += 1
+            h["event_s"] = due_s + slow_fit.interval()
+        else:
+            self._send_rows(pack_type, is_request=True)
+            fit["request"], fit["begun_s"] = self._sequence, h["elapsed_s"]
+            h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
+
+    def _adopt(self, slow_fit: SlowFit) -> None:
+        """Adopt the received fit, unless the filter knows the SOC better. After an exception, the previous fit stays in force."""
+        received, estimator = self._fit["received"], slow_fit.estimator
+        if not received["min_filter_std"] <= self._filter["soc_std"]:
+            return
+        before = estimator.record.copy(), estimator.settings_record.copy()
+        try:
+            slow_fit.adopt(fit_of_record(received))
+        except Exception:  # noqa: BLE001 - a failed fit must not end the estimates of the pack
+            estimator.record[...], estimator.settings_record[...] = before
+            self._counters["failed_fits"] += 1
+        else:
+            self._fit["in_force"] = received
+            self._counters["fits"] += 1
+
+    def _send_rows(self, pack_type: PackType, *, is_request: bool = False) -> None:
+        """Send the completed rows, and a request for a fit of all rows so far."""
+        h = self._h
+        rows = h["rows"][: int(h["count"])].copy()
+        h["count"] = 0
+        h["rows"] = np.zeros(1, HISTORY_ROW)
+        position, identity = RowsPosition(self._sequence, len(self._messages)), f"{self._pack}.{self._sequence}"
+        data = encode_rows(Rows(rows, position, pack_type.state_digest))
+        self._messages.append(HistoryMessage(subjects.history(self._pack), data, f"{identity}.{position.part}"))
+        if is_request:
+            request = FitRequest(sequence=self._sequence, part=position.part).model_dump_json().encode()
+            self._messages.append(HistoryMessage(subjects.fit_request(self._pack), request, identity))
+
+
+def write_fit(record: np.void, result: FitResult, sequence: int) -> None:
+    """Write the result of a fit to a record of dtype ``PACK_FIT``. A failed fit is never adopted."""
+    record["sequence"] = sequence
+    record["min_filter_std"] = math.inf if result.fit is None else result.min_filter_std
+    for name, value in curve_arrays(result.fit).items():
+        record[name] = value
+    record["is_exchanged"] = result.fit is not None and result.fit.is_exchanged
+
+
+def fit_of_record(record: np.void) -> PackFit:
+    """Return the fit in a record of dtype ``PACK_FIT``."""
+    arrays: dict[str, NDArray[Any]] = {name: np.asarray(record[name]) for name in PACK_FIT.names or ()}
+    fit = fit_of_curves(arrays)
+    assert fit is not None  # noqa: S101 - for the type checker: there are arrays
+    return replace(fit, is_exchanged=bool(record["is_exchanged"]))
