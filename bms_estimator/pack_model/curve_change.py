@@ -64,5 +64,5 @@ def return_to_cell_file(estimator: Estimator) -> None:
         for j in (LN_R0, LN_R):
             covariance[j, :] = covariance[:, j] = 0.0
             covariance[j, j] = variance
-        reset_ocv_correction(mean, covariance)
+        reset_ocv_correction(settings[0], mean, covariance)
     store_last_good_state(estimator.record[0]["checks"], f)

@@ -10,6 +10,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import MIN_BIAS_OF_R_STD, MIN_SOC_STD
 from bms_estimator.kernels.kalman_filter.ekf import MAX_SOC, MIN_SOC
 from bms_estimator.kernels.kalman_filter.mixture import clear_hypothesis, copy_hypothesis, mixture_moments
+from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import (
     HYPOTHESES,
     LN_Q,
@@ -72,9 +73,10 @@ def _adopt_ocv(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
     settings["ocv_v"] = np.maximum.accumulate(ocv_v)  # an OCV increases with the SOC
     settings["ocv_slope_v"] = np.maximum(np.gradient(settings["ocv_v"], soc), MIN_SLOPE_V * series)
     node_v2 = np.maximum(np.interp(SOC_GRID, NODE_SOC, np.diag(fit.covariance)[FIT_CURVE]), MIN_CURVE_STD_V**2)
-    total_v2 = node_v2 + CellCurves(file_settings).direction_std_v ** 2
-    settings["curve_error_v"] = series * np.sqrt(total_v2)
-    settings["learned"] = node_v2.mean() / total_v2.mean()
+    direction_std_v = CellCurves(file_settings).direction_std_v
+    settings["constant_error_v"], settings["varying_error_v"] = series * np.sqrt(node_v2), series * direction_std_v
+    settings["curve_error_v"] = series * np.sqrt(node_v2 + direction_std_v**2)
+    settings["node_correlation"] = NODE_CORRELATION
 
 
 def _adopt_resistances(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
@@ -158,7 +160,7 @@ def _state_covariance(fit: PackFit, p: np.void) -> Floats:
 
 def series_curve_std(p: np.void) -> Floats:
     """Return the std of the OCV nodes of the pack [V]."""
-    return np.asarray(np.sqrt(float(p["learned"])) * p["curve_error_v"])
+    return np.asarray(p["constant_error_v"])
 
 
 def _decouple(covariance: Floats, states: list[int]) -> None:
