@@ -68,4 +68,4 @@ def return_to_cell_file(f: np.void, settings: NDArray[np.void], cell_file: np.vo
         for j in (LN_R0, LN_R):
             covariance[j, :] = covariance[:, j] = 0.0
             covariance[j, j] = variance
-        reset_ocv_correction(mean, covariance)
+        reset_ocv_correction(settings[0], mean, covariance)

@@ -3,6 +3,7 @@
 (2.5)-(2.9) are equations of the thesis: the circuit elements as functions of SOC with parameters a1..a15.
 """
 
+import math
 from dataclasses import fields, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.current_interpolation import PERIODS
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANCES, TAU_S, weak_share
+from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, Noise
 from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.model.unmeasured_time import UNMEASURED_S
@@ -26,9 +28,14 @@ MAX_SLOPE_V = 5.0
 steep ends of the curve."""
 LEARNED_FRACTION = 0.97
 """Fraction of the OCV's error variance that is constant and is learned."""
-MIN_LEARNED_SLOPE_V = 0.15
-"""Minimum slope dOCV/dSOC per cell over the whole curve for learning the OCV's error [V]. On a plateau the voltage
-cannot distinguish an error of the curve from an error of the SOC, and the knees move."""
+PLATEAU_SLOPE_V = 0.15
+"""Slope dOCV/dSOC per cell below which the OCV has a plateau [V]. There the voltage cannot distinguish an error of the curve from an
+error of the SOC, and the knees move. Only an error that is common to all SOCs is then learned."""
+LEVEL_STD_V = 2.0 * CURVE_ERROR_V
+"""Std of a measured curve [V]. If most of the curve is a plateau, the smallest std beyond this one is that of the level, in which makes
+differ (A123 26650 and ``lfp``: by 11 mV, with a std of 4 mV along the plateau)."""
+COMMON_CORRELATION = 0.9999
+"""Correlation of the constant errors at two neighboring nodes of an OCV with a plateau. A correlation of 1 has no inverse."""
 CURVE_SOC = 0.3
 """Correlation length of the OCV's error in SOC."""
 KNEE_V = 1.0
@@ -156,7 +163,12 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
                 p["curve_error_v" if name == "error_v" else name] = np.interp(SOC_GRID, ocv.soc, column)
         if ocv.error_v is not None:
             p["curve_error_v"] = np.hypot(p["curve_error_v"], COUNT_ERROR_SOC * slope_v)
-    p["learned"] = LEARNED_FRACTION if slope_v.min() >= MIN_LEARNED_SLOPE_V * series else 0.0
+    has_plateau = slope_v.min() < PLATEAU_SLOPE_V * series
+    if np.median(slope_v) < PLATEAU_SLOPE_V * series:
+        p["constant_error_v"] = math.sqrt(max(p["curve_error_v"].min() ** 2 - (LEVEL_STD_V * series) ** 2, 0.0))
+    elif not has_plateau:
+        p["constant_error_v"] = math.sqrt(LEARNED_FRACTION) * p["curve_error_v"]
+    p["node_correlation"] = COMMON_CORRELATION if has_plateau else NODE_CORRELATION
     if hysteresis_v is not None:
         p["hysteresis_v"] = 0.5 * hysteresis_v * series
         if not is_mean_curve:  # a curve without hysteresis was measured after discharge
@@ -173,6 +185,8 @@ def _add_voltage_gain_error(p: np.void, gain_std: float) -> None:
         gain_std: Relative std of the gain.
     """
     ocv_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
+    p["varying_error_v"] = np.sqrt(p["curve_error_v"] ** 2 - p["constant_error_v"] ** 2)
+    p["constant_error_v"] = np.hypot(p["constant_error_v"], gain_std * ocv_v)
     p["curve_error_v"] = np.hypot(p["curve_error_v"], gain_std * ocv_v)
     p["voltage_gain_std"] = gain_std
 

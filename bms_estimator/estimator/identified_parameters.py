@@ -14,7 +14,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import on_grid
 from bms_estimator.kernels.identifier import MIN_BINS
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
-from bms_estimator.kernels.kalman_filter.ocv_correction import node_error_scale, node_position
+from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION, node_error_scale, node_position
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
 from bms_estimator.model.cell import CellModel, TableOcv
 
@@ -148,8 +148,8 @@ def ocv_correction_with_std(
     """
     f, p = record["filter"], settings["filter"]
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]][NODE:, NODE:]
-    rows, curve_error_v = _node_weights(p.tobytes(), soc.tobytes())
-    variance_v2 = ((rows @ covariance) * rows).sum(axis=1) + (1.0 - p["learned"]) * curve_error_v**2
+    rows, varying_error_v = _node_weights(p.tobytes(), soc.tobytes())
+    variance_v2 = ((rows @ covariance) * rows).sum(axis=1) + varying_error_v**2
     return rows @ mean[NODE:], np.sqrt(variance_v2)
 
 
@@ -162,13 +162,13 @@ def _node_weights(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], ND
         socs: Bytes of an array of SOCs, float64.
     """
     p, soc = np.frombuffer(bytearray(settings), EKF_SETTINGS)[0], np.frombuffer(socs)
-    rows, curve_error_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
+    rows, varying_error_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
     for n, x in enumerate(soc):
         i, t = node_position(x)
         volts = node_error_scale(p, x, t)
         rows[n, i], rows[n, i + 1] = volts * (1.0 - t), volts * t
-        curve_error_v[n] = on_grid(x, p["curve_error_v"])
-    return rows, curve_error_v
+        varying_error_v[n] = on_grid(x, p["varying_error_v"])
+    return rows, varying_error_v
 
 
 def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
@@ -197,7 +197,7 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
         for name in ("weak_ohm", "strong_ohm"):
             values["ladder"][name] = (factors * np.array(values["ladder"][name])).tolist()
         values["ladder"]["std"] = r_std
-    if settings["filter"]["learned"] > 0.0:
+    if settings["filter"]["node_correlation"] <= NODE_CORRELATION:
         values["ocv"] = _corrected_ocv(estimator, cell, series)
     return CellModel.model_validate(values)
 

@@ -9,6 +9,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import MIN_BIAS_OF_R_STD, MIN_SOC_STD
 from bms_estimator.estimator.fitted_state import FittedState
+from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS
 from bms_estimator.model.arrays import Floats
@@ -66,9 +67,10 @@ def _adopt_ocv(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
     settings["ocv_v"] = np.maximum.accumulate(ocv_v)  # an OCV increases with the SOC
     settings["ocv_slope_v"] = np.maximum(np.gradient(settings["ocv_v"], soc), MIN_SLOPE_V * series)
     node_v2 = np.maximum(np.interp(SOC_GRID, NODE_SOC, np.diag(fit.covariance)[FIT_CURVE]), MIN_CURVE_STD_V**2)
-    total_v2 = node_v2 + CellCurves(file_settings).direction_std_v ** 2
-    settings["curve_error_v"] = series * np.sqrt(total_v2)
-    settings["learned"] = node_v2.mean() / total_v2.mean()
+    direction_std_v = CellCurves(file_settings).direction_std_v
+    settings["constant_error_v"], settings["varying_error_v"] = series * np.sqrt(node_v2), series * direction_std_v
+    settings["curve_error_v"] = series * np.sqrt(node_v2 + direction_std_v**2)
+    settings["node_correlation"] = NODE_CORRELATION
 
 
 def _adopt_resistances(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
@@ -120,11 +122,6 @@ def adopt_state(estimator: Estimator, fit: PackFit) -> None:
 
 def _state_covariance(fit: PackFit, p: np.void) -> Floats:
     """Return the fit's covariance in the units of the filter, in the order of ``FILTER_STATES``."""
-    node_std_v = np.interp(NODE_SOC, SOC_GRID, series_curve_std(p)) / float(p["series"])
+    node_std_v = np.interp(NODE_SOC, SOC_GRID, p["constant_error_v"]) / float(p["series"])
     unit = np.r_[1.0, 1.0, float(p["capacity_as"]) / HOUR_S, 1.0 / node_std_v]
     return np.asarray(fit.covariance[np.ix_(FIT_RESULTS, FIT_RESULTS)] * np.outer(unit, unit))
-
-
-def series_curve_std(p: np.void) -> Floats:
-    """Return the std of the OCV nodes of the pack [V]."""
-    return np.asarray(np.sqrt(float(p["learned"])) * p["curve_error_v"])

@@ -4,12 +4,14 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell import CellModel, generic_cells, load_cell
 from bms_estimator.model.config_file import error_reason, without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
+from bms_estimator.protocols.base.device import BMS_GAIN_STD
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import PackSettings, Settings, load_settings
+from bms_estimator.settings.sampling import BOARD_GAIN_STD
 from bms_estimator.settings.sensor import SensorSettings
 
 LABORATORY_RESOLUTION_V = 1e-3
@@ -46,9 +48,7 @@ def pack_or_cell(
     """
     if pack is None and cell is None:
         raise UserError("give either --cell NAME|CELL.toml or --pack pack.toml")
-    settings = (
-        load_settings(pack) if pack else Settings(sensor=SensorSettings(voltage_resolution_v=LABORATORY_RESOLUTION_V))
-    )
+    settings = load_settings(pack) if pack else Settings(sensor=_unknown_sensor(str(cell)))
     if series is not None:
         settings = with_pack(settings, series=series)
     if cell is None and pack is not None:
@@ -57,6 +57,15 @@ def pack_or_cell(
         capacity_ah = settings.pack.capacity_ah
     model = _model(settings, str(cell), capacity_ah)
     return with_pack(settings, cell=cell, capacity_ah=capacity_ah), model
+
+
+def _unknown_sensor(cell: str) -> SensorSettings:
+    """Return the sensor of a capture without a pack file.
+
+    A cell file may have been measured with the sensor of the capture. The gain relative to a generic cell is that of any sensor.
+    """
+    gain_std = BMS_GAIN_STD if cell in generic_cells() else BOARD_GAIN_STD
+    return SensorSettings(voltage_resolution_v=LABORATORY_RESOLUTION_V, voltage_gain_std=gain_std)
 
 
 def _locate_cell(pack: Path, cell: str) -> str:

@@ -15,6 +15,7 @@ from bms_estimator.kernels.forecast.constant_current import (
     open_circuit_voltage,
     scaled_resistances,
 )
+from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import SOC, X
 from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
@@ -150,7 +151,9 @@ def constant_voltage_current(
         ohm: Scratch space of shape (RESISTANCES,).
     """
     capacity_as = hypothesis_capacity(s, p, q)
-    lead_s = LEAD_S if p.learned == 0.0 else 0.0  # the filter learns no OCV error if the OCV has a plateau
+    lead_s = (
+        LEAD_S if p.node_correlation > NODE_CORRELATION else 0.0
+    )  # 0 without a plateau, and with the curves of a fit
     lead_decay = math.exp(-dt_s / TAUS[LEAD_PAIR])
     surface_soc = soc - lead_s * lead_decay * x[LEAD_PAIR] / capacity_as
     rise_soc = -guess_a * (dt_s + lead_s * (1.0 - lead_decay)) / capacity_as

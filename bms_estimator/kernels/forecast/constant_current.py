@@ -60,7 +60,7 @@ def open_circuit_voltage(s: Record, p: Record, q: int, soc: float, elapsed_s: fl
     voltage_v = ocv(soc, p.ocv_v, p.ocv_slope_v) + ocv_correction(p, x, soc)
     voltage_v += (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
     voltage_v += s.hysteresis * on_grid(soc, p.hysteresis_v) * h
-    voltage_v += math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v) * curve
+    voltage_v += on_grid(soc, p.varying_error_v) * curve
     return voltage_v + x[B_SLOW] * math.exp(-elapsed_s / p.slow_s) + x[B_FAST] * math.exp(-elapsed_s / p.fast_s)
 
 

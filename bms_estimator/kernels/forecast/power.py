@@ -188,7 +188,7 @@ def voltage_variance(
         h[LN_R] -= ohm[1 + k] * branch_current(s, q, k, current_a, elapsed_s)
     h[B_SLOW], h[B_FAST] = math.exp(-elapsed_s / p.slow_s), math.exp(-elapsed_s / p.fast_s)
     h[HYST] = s.hysteresis * on_grid(soc, p.hysteresis_v)
-    h[CURVE] = math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v)
+    h[CURVE] = on_grid(soc, p.varying_error_v)
     i, t = node_position(soc)
     node_v = node_error_scale(p, soc, t)
     h[NODE + i], h[NODE + i + 1] = (1.0 - t) * node_v, t * node_v

@@ -115,7 +115,7 @@ def project_voltage(m: Record, s: Record, p: Record) -> None:
         m.voltage_v[j] = (
             p.ocv_v[j]
             + s.hysteresis * on_grid(soc, p.hysteresis_v) * hysteresis
-            + math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v) * x[CURVE]
+            + on_grid(soc, p.varying_error_v) * x[CURVE]
             + ocv_correction(p, x, soc)
             + (s.temperature_c - REFERENCE_C) * on_grid(soc, p.per_kelvin_v)
         )

@@ -244,7 +244,7 @@ def linearise(s: Record, p: Record, q: int, about_soc: float, about_variance: fl
     h[OFFSET] = r_0_factor * ohm[0]
     h[B_SLOW] = h[B_FAST] = 1.0
     h[HYST] = s.hysteresis * on_grid(soc, p.hysteresis_v)
-    h[CURVE] = math.sqrt(1.0 - p.learned) * on_grid(soc, p.curve_error_v)
+    h[CURVE] = on_grid(soc, p.varying_error_v)
     i, t = node_position(soc)
     node_v = node_error_scale(p, soc, t)
     h[NODE + i], h[NODE + i + 1] = (1.0 - t) * node_v, t * node_v

@@ -129,7 +129,7 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
     s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
-    reset_ocv_correction(x, cov)
+    reset_ocv_correction(p, x, cov)
     spawn_hypotheses(s, p, soc, p.soc_std)
     reset_window(s)
 
@@ -258,7 +258,7 @@ def end_learning(s: Record, p: Record) -> None:
     """
     s.learned_soc = p.learning_soc
     for q in range(s.count):
-        reset_ocv_correction(s.mean[q], s.covariance[q])
+        reset_ocv_correction(p, s.mean[q], s.covariance[q])
 
 
 @njit(cache=True)

@@ -1,9 +1,9 @@
 """Correction of the cell file's OCV curve, learned by the filter as states at SOC nodes.
 
-The fraction ``learned`` of the variance of the curve's error is constant and recurs at each pass of an SOC. It is
-interpolated between ``NODES`` states, scaled so that the variance between nodes equals that at nodes. The states are in
-units of the curve's std and are correlated along SOC over ``CORRELATION_SOC``. The remaining error, CURVE, depends on
-temperature, load and history and varies.
+The part ``constant_error_v`` of the curve's error recurs at each pass of an SOC. It is interpolated between ``NODES`` states,
+scaled so that the variance between nodes equals that at nodes. The states are in units of its std and are correlated along
+SOC: over ``CORRELATION_SOC``, or over the whole curve of a cell with a plateau, of which only the level is learned. The
+remaining error, CURVE, depends on temperature, load and history and varies.
 
 A voltage depends on SOC and curve together, so that its information on the curve is limited by the uncertainty of the SOC.
 The joint covariance contains this limit, so that no rule has to select voltages for learning (as in simultaneous
@@ -26,7 +26,7 @@ CORRELATION_SOC = 0.6
 """Correlation length of the OCV's error [SOC]. It is long, because cells of one chemistry differ in the used range of the
 electrodes."""
 NODE_CORRELATION = math.exp(-1.0 / (NODES - 1) / CORRELATION_SOC)
-"""Prior correlation of two neighbouring nodes."""
+"""Prior correlation of two neighboring nodes of a cell without a plateau, and of the curve of a fit."""
 
 
 @njit(cache=True)
@@ -40,8 +40,8 @@ def node_position(soc: float) -> tuple[int, float]:
 @njit(cache=True)
 def node_error_scale(p: Record, soc: float, t: float) -> float:
     """Return the scale of the interpolated node states at ``soc`` [V], normalized to a constant variance between nodes."""
-    interpolated_variance = 1.0 - 2.0 * t * (1.0 - t) * (1.0 - NODE_CORRELATION)
-    return on_grid(soc, p.curve_error_v) * math.sqrt(p.learned / interpolated_variance)
+    interpolated_variance = 1.0 - 2.0 * t * (1.0 - t) * (1.0 - p.node_correlation)
+    return on_grid(soc, p.constant_error_v) / math.sqrt(interpolated_variance)
 
 
 @njit(cache=True)
@@ -52,11 +52,11 @@ def ocv_correction(p: Record, x: Floats, soc: float) -> float:
 
 
 @njit(cache=True)
-def reset_ocv_correction(x: Floats, covariance: Floats) -> None:
+def reset_ocv_correction(p: Record, x: Floats, covariance: Floats) -> None:
     """Reset the nodes to their prior."""
     x[NODE : NODE + NODES] = 0.0
     covariance[NODE : NODE + NODES, :] = 0.0
     covariance[:, NODE : NODE + NODES] = 0.0
     for j in range(NODES):
         for k in range(NODES):
-            covariance[NODE + j, NODE + k] = NODE_CORRELATION ** abs(j - k)
+            covariance[NODE + j, NODE + k] = p.node_correlation ** abs(j - k)

@@ -119,7 +119,9 @@ EKF_SETTINGS = np.dtype(
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
         ("curve_error_v", "f8", GRID),  # std of E_o, including the voltage sensor's gain [V]
         ("voltage_gain_std", "f8"),  # relative std of the voltage sensor's gain
-        ("learned", "f8"),  # constant fraction of the variance of E_o, which is learned: ``ocv_correction``
+        ("constant_error_v", "f8", GRID),  # part of this std that is equal in each pass: ``ocv_correction`` [V]
+        ("varying_error_v", "f8", GRID),  # remaining part, CURVE [V]
+        ("node_correlation", "f8"),  # prior correlation of the constant errors at two neighboring nodes
         ("curve_soc", "f8", GRID),  # charge throughput over which the varying error of E_o changes [SOC]
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
         ("hysteresis_v", "f8", GRID),  # half of E_o after charge less E_o after discharge, at 25 C [V]

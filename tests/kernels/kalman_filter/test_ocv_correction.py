@@ -1,10 +1,12 @@
 """Correction of the cell file's OCV by states of the filter, one for each node of the SOC."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bms_estimator import load_capture
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import ocv_correction_with_std
 from bms_estimator.kernels.kalman_filter.ocv_correction import (
@@ -18,6 +20,8 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.protocols.base.device import BMS_GAIN_STD
+from bms_estimator.settings.sampling import Sampling
 from tests.estimator.anywhere.cases import OXIDE, Case, cell_file, load_a
 from tests.estimator.anywhere.truth import simulate
 from tests.fit_interval import fits_every
@@ -30,15 +34,15 @@ CURVE_GRID = np.linspace(0.0, 1.0, 41)
 def test_the_initial_variance_of_the_correction_equals_that_of_the_ocv_at_and_between_nodes() -> None:
     p = Estimator(GENERIC).settings_record[0]["filter"]
     x, covariance = np.ones(STATES), np.ones((STATES, STATES))  # values that the reset must replace
-    reset_ocv_correction(x, covariance)
+    reset_ocv_correction(p, x, covariance)
     assert (x[NODE:] == 0.0).all()
     assert (covariance[:NODE, NODE:] == 0.0).all()
     for soc in (0.0, 0.3, 0.325, 0.34, 0.9876, 1.0):
         i, fraction = node_position(soc)
         h = np.zeros(STATES)
         h[NODE + i], h[NODE + i + 1] = node_error_scale(p, soc, fraction) * np.array([1.0 - fraction, fraction])
-        error_v = np.interp(soc, CURVE_GRID, p["curve_error_v"])
-        assert np.isclose(h @ covariance @ h, p["learned"] * error_v**2, rtol=1e-12)
+        error_v = np.interp(soc, CURVE_GRID, p["constant_error_v"])
+        assert np.isclose(h @ covariance @ h, error_v**2, rtol=1e-12)
 
 
 def test_the_correction_is_interpolated_between_nodes_in_units_of_the_ocv_error() -> None:
@@ -46,22 +50,36 @@ def test_the_correction_is_interpolated_between_nodes_in_units_of_the_ocv_error(
     x = np.zeros(STATES)
     x[NODE:] = np.arange(NODES)
     for soc in (0.05, 0.5, 0.95):
-        error_v = np.interp(soc, CURVE_GRID, p["curve_error_v"])
-        assert np.isclose(ocv_correction(p, x, soc), soc * (NODES - 1) * error_v * np.sqrt(p["learned"]))
+        error_v = np.interp(soc, CURVE_GRID, p["constant_error_v"])
+        assert np.isclose(ocv_correction(p, x, soc), soc * (NODES - 1) * error_v)
     assert ocv_correction(p, x, -0.1) == ocv_correction(p, x, 0.0)
     assert ocv_correction(p, x, 1.1) == ocv_correction(p, x, 1.0)
 
 
-def test_an_ocv_with_a_plateau_is_not_learned() -> None:
-    """On a plateau the voltage determines neither SOC nor OCV. Therefore the error of the OCV stays that of the cell file."""
+def test_only_the_level_of_an_ocv_with_a_plateau_is_learned() -> None:
+    """On a plateau the voltage determines neither SOC nor the shape of the OCV."""
     estimator = Estimator(load_cell("lfp", 2.0), initial_soc=0.5)
     for second in range(1200):
-        estimator.step(float(second), current_a=1.0, voltage_v=3.25)
-    f = estimator.record[0]["filter"]
-    assert (f["mean"][f["best"]][NODE:] == 0.0).all()
+        estimator.step(float(second), current_a=1.0, voltage_v=3.35)
     correction_v, std_v = ocv_correction_with_std(estimator.record[0], estimator.settings_record[0], CURVE_GRID)
-    assert (correction_v == 0.0).all()
-    assert np.allclose(std_v, estimator.settings_record[0]["filter"]["curve_error_v"])
+    assert correction_v.min() > 0.005
+    assert np.ptp(correction_v) < 0.1 * correction_v.min()
+    p = estimator.settings_record[0]["filter"]
+    assert (std_v > 0.9 * p["varying_error_v"]).all()
+    assert std_v.min() < 0.95 * p["curve_error_v"].min()
+
+
+def test_the_level_of_a_plateau_is_learned_from_a_cell_of_another_make(shared_data: Path) -> None:
+    """The voltage of this LFP cell is 53 to 66 mV above the generic curve. The estimator starts at a true SOC of 0.64."""
+    path = shared_data / "new" / "lfp3_p35ah_id.csv.gz"
+    samples = load_capture(path).rows
+    time_s, true_soc = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 4), unpack=True)
+    samples = samples[np.interp(samples["time_s"], time_s, true_soc) < 0.64]
+    cell, sampling = load_cell("lfp", 3.5), Sampling(period_s=1.0, voltage_gain_std=BMS_GAIN_STD)
+    trace = Estimator(cell, sampling=sampling).run(samples)
+    error = trace["soc"] - np.interp(trace["time_s"], time_s, true_soc)
+    assert np.sqrt(np.mean(error**2)) < 0.09
+    assert (np.abs(error) < 2.0 * trace["soc_std"]).mean() > 0.8
 
 
 FIT_INTERVAL_S = 3.0 * 3600.0
