@@ -495,6 +495,11 @@ async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_p
             ['relay = "high": the pin is low after each reset and without power'],
         ),
         ({"relay": "high", "when_silent": "high", "alarms": ["soc_low"]}, []),
+        (
+            {"relay": "low", "when_silent": "low", "alarms": ["cell_over_voltage", "cell_short"]},
+            ["alarms: the board measures no cell voltages"],
+        ),
+        ({"relay": "low", "when_silent": "low", "alarms": ["cell_over_voltage", "pack_over_voltage"]}, []),
         ({"run": ["true"]}, ["on: with several alarms, cleared is reported while others are still raised"]),
         ({"run": ["true"], "on": ["first_raised", "last_cleared"]}, []),
         ({"run": ["true"], "alarms": ["soc_low"]}, []),
