@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import psutil
 from nats.aio.client import Client
 from nats.errors import Error as NatsError
 
@@ -146,8 +147,12 @@ class Fitter:
             self._process = subprocess.Popen([str(PROGRAM), "fleet", "fit", "--server", url], stderr=log)
 
     def kill(self) -> None:
+        """Send SIGKILL, and wait until the processes that fit have ended too."""
+        children = psutil.Process(self._process.pid).children()
         self._process.kill()
         self._process.wait(LONG_S)
+        _, remaining = psutil.wait_procs(children, LONG_S)
+        assert remaining == []
 
     def end(self) -> int:
         """Send SIGTERM and return the exit code."""

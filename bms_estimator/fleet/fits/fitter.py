@@ -6,6 +6,7 @@ previous fit, are in the stream ``HISTORY``. Several processes share the request
 
 import asyncio
 import multiprocessing
+import os
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -32,6 +33,7 @@ from bms_estimator.fleet.nats.stream_reader import StreamError, read_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.model.errors import TemporaryError
+from bms_estimator.process.child_process import end_with
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 
@@ -179,7 +181,9 @@ class Fitter:
         """Run a fit in another process. Return None if rows are missing, or if the process has died."""
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self._options.processes, context)
+            self._pool = ProcessPoolExecutor(
+                self._options.processes, context, initializer=end_with, initargs=(os.getpid(),)
+            )
         try:
             return await asyncio.get_running_loop().run_in_executor(self._pool, run_job, job)
         except BrokenProcessPool:
