@@ -99,7 +99,7 @@ EXIT_CODES = """\
 | 0 | done, also after Ctrl-C or SIGTERM of a command that runs until it is ended |
 | 1 | an internal error with a traceback, a full or broken disk, a closed output pipe, or a fault that `doctor` found |
 | 2 | an error that you can correct; `error:` lines on stderr name it |
-| 75 | a fault of the environment that may end without a change of yours, such as a folder or file that is not there yet, or another process that serves the pack; repeat the command later. systemd restarts a service |
+| 75 | a fault of the environment that may end without a change of yours, such as a folder or file that is not there yet, a damaged file with a password, token or certificate, or another process that serves the pack; repeat the command later. systemd restarts a service |
 | 130 | interrupted before the end, or before it began |
 
 Results are written to stdout, everything else to stderr. `--json` prints exactly one object.

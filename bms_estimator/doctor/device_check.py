@@ -16,7 +16,7 @@ from bms_estimator.doctor.subject import Subject
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.sources.factory import open_line_source
-from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.known_board_file import STORED_FIELDS, KnownBoardFile
 from bms_estimator.sources.serial.port_list import NoPortError, holder, resolve_port
 from bms_estimator.sources.serial.serial_source import SerialSource
 
@@ -31,7 +31,7 @@ SERIAL_REMEDY = "check cable, sensor.protocol and sensor.baud; see which device 
 """Remedy for a silent device on a serial port."""
 SOURCE_REMEDY = "check the device and the section [source]"
 """Remedy for a silent device that is not on a serial port."""
-CALIBRATION_FIELDS = ("divider", "volts_per_ampere", "bandgap_v")
+CALIBRATION_FIELDS = STORED_FIELDS[1:]
 """Fields of a board's hello that its calibration changes."""
 
 

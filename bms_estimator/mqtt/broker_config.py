@@ -51,7 +51,7 @@ def password(settings: BrokerSettings) -> str | None:
     """Read the broker's password.
 
     Raises:
-        UserError: The file cannot be read.
+        TemporaryError: The file cannot be read.
     """
     if settings.password_file is None:
         return None
@@ -63,21 +63,23 @@ def password(settings: BrokerSettings) -> str | None:
             f"{section}.password_file = {settings.password_file}: cannot be read: {error.strerror}"
         ) from None
     except UnicodeDecodeError:  # its text would show bytes of the password
-        raise UserError(f"{section}.password_file = {settings.password_file}: cannot be read: not UTF-8 text") from None
+        raise TemporaryError(
+            f"{section}.password_file = {settings.password_file}: cannot be read: not UTF-8 text"
+        ) from None
 
 
 def tls_context(settings: BrokerSettings) -> ssl.SSLContext:
     """Create a TLS context from the certificate files, which may have been replaced since the last connection.
 
     Raises:
-        UserError: A file cannot be read, or is invalid.
+        TemporaryError: A file cannot be read, or is invalid, perhaps because it is being replaced.
+        UserError: The key is encrypted.
     """
     section = settings.section
     try:
         context = ssl.create_default_context(cafile=settings.ca_file)
     except OSError as error:  # includes ssl.SSLError
-        kind = UserError if isinstance(error, ssl.SSLError) else TemporaryError
-        raise kind(f"{section}.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
+        raise TemporaryError(f"{section}.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     if settings.cert_file is not None:
         _load_client_certificate(context, settings, settings.cert_file)
@@ -127,7 +129,8 @@ def _load_client_certificate(context: ssl.SSLContext, settings: BrokerSettings, 
     """Load the client certificate and its key. Without a key file, the certificate file contains the key.
 
     Raises:
-        UserError: A file cannot be read, or the key does not match the certificate.
+        TemporaryError: A file cannot be read, or the key does not match the certificate.
+        UserError: The key is encrypted.
     """
     key_file, section = settings.key_file or cert_file, settings.section
     # load_cert_chain does not name the file that it cannot read
@@ -143,10 +146,10 @@ def _load_client_certificate(context: ssl.SSLContext, settings: BrokerSettings, 
         )
     except ssl.SSLError as error:
         if error.reason == "KEY_VALUES_MISMATCH":
-            raise UserError(
+            raise TemporaryError(
                 f"{section}.key_file = {key_file}: is not the key of {section}.cert_file = {cert_file}"
             ) from None
-        raise UserError(
+        raise TemporaryError(
             f"{section}.cert_file = {cert_file}, {section}.key_file = {key_file}: must be a PEM certificate and its key: {error}"
         ) from None
 

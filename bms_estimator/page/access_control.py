@@ -11,7 +11,7 @@ import socket
 from collections.abc import Iterable
 from urllib.parse import urlsplit
 
-from bms_estimator.model.errors import TemporaryError, UserError
+from bms_estimator.model.errors import TemporaryError
 from bms_estimator.process.systemd import credential
 from bms_estimator.settings.page import PageSettings
 
@@ -72,7 +72,7 @@ def make_access_control(settings: PageSettings, token: str | None = None) -> Acc
         token: Required token if the settings name no file; None: no token is required.
 
     Raises:
-        UserError: The token cannot be read, or is too short.
+        TemporaryError: The token cannot be read, or is too short.
     """
     return AccessControl((settings.address.host, *settings.hosts), _token(settings) or token)
 
@@ -86,9 +86,9 @@ def _token(settings: PageSettings) -> str | None:
     except OSError as error:
         raise TemporaryError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:  # the text of the error would show bytes of the token
-        raise UserError(f"page.token_file = {name}: cannot be read: not UTF-8 text") from None
+        raise TemporaryError(f"page.token_file = {name}: cannot be read: not UTF-8 text") from None
     if len(token) < MIN_TOKEN_CHARACTERS:
-        raise UserError(
+        raise TemporaryError(
             f"page.token_file = {name}: the token has {len(token)} letters, must have {MIN_TOKEN_CHARACTERS} or more; "
             f"`openssl rand -hex 16 > {name}` makes one"
         )

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Iterator
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.settings.alarm_kinds import ALARM_KINDS
 from bms_estimator.settings.alarm_limits import STATE_LOST
 from bms_estimator.settings.alarms import ALARMS, AlarmHook, AlarmSettings
 from bms_estimator.settings.pack import Settings
@@ -60,6 +61,11 @@ def _relay_warnings(hook: AlarmHook, alarms: AlarmSettings) -> Iterator[str]:
         yield (
             f'relay = "high": the pin is low after each reset and without power, which connects the load during an alarm; '
             f'for critical alarms, such as {critical[0]}, use relay = "low" and a normally open contact'
+        )
+    if all("cells" in ALARM_KINDS[name].needs for name in names):
+        yield (
+            "alarms: the board measures no cell voltages, so that none of these alarms is ever raised; add alarms of the "
+            "pack, such as pack_over_voltage"
         )
 
 

@@ -121,8 +121,8 @@ def _list_processes(leader: int, marked_variable: bytes) -> list[int]:
             continue
         pid = int(folder.name)
         try:
-            state, parent, _group, session = (folder / "stat").read_text().rpartition(")")[2].split()[:4]
-            if state in "ZX":  # zombie or dead
+            state, parent, _group, session = (folder / "stat").read_bytes().rpartition(b")")[2].split()[:4]
+            if state in b"ZX":  # zombie or dead
                 continue
             parents[pid] = int(parent)
             if int(session) == leader or marked_variable in (folder / "environ").read_bytes().split(b"\0"):

@@ -233,6 +233,7 @@ class PublishHook(JobHook):
         super().__init__(settings, device)
         self._topic, self._publish = topic, publish
         self._backoff = Backoff(FIRST_RETRY_S)
+        self._newest: dict[str, Job] = {}  # the last published job by key
         self._unfinished: set[asyncio.Task[None]] = set()  # one task for each message without a final result
 
     @property
@@ -249,6 +250,7 @@ class PublishHook(JobHook):
         """Queue the message at once, so that a shutdown saves it, and await its result in a task."""
         result: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         payload = Template(self.settings.payload).substitute(self._fields(job)).encode()
+        self._newest[job.key] = job
         self._publish(self._topic, payload, result.set_result)
         task = asyncio.create_task(self._await_result(job, result), name="alarm hook message")
         self._unfinished.add(task)
@@ -256,7 +258,7 @@ class PublishHook(JobHook):
         return True
 
     async def _await_result(self, job: Job, result: asyncio.Future[str]) -> None:
-        """Await the result of a message. Repeat the job of a rejected or lost message, unless its alarm has changed."""
+        """Await the result of a message. Repeat the newest job of an alarm after a rejection or loss, if it is still due."""
         if not (await asyncio.wait([result], timeout=self.settings.timeout_s))[0]:
             self._fail_with_log(
                 job, f"not acknowledged by the broker within {self.settings.timeout_s:g} s; still queued"
@@ -265,7 +267,8 @@ class PublishHook(JobHook):
         if reason := result.result():
             self._fail_with_log(job, f"not delivered: {reason}")
             await asyncio.sleep(self._backoff.next_s())
-            self._jobs.put_back(job)
+            if job is self._newest[job.key]:
+                self._jobs.put_back(job)
             self._wake.set()
         else:
             self._succeed()

@@ -30,6 +30,7 @@ from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.sink import Sink
+from bms_estimator.sources.serial.board_check import BoardCheck
 from bms_estimator.sources.source import Source
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
 
@@ -51,6 +52,8 @@ class ServiceParts:
     """Dispatcher at which the loop registers its handlers."""
     current_zero: Callable[[], Awaitable[None]] | None = None
     """Makes the board store the present current as zero; None: the source has no such command."""
+    board_check: BoardCheck | None = None
+    """Reports another calibration of the board; None: the source has no such check."""
     notifier: SystemdNotifier | None = None
     """Is notified that the loop is ready and alive."""
     hooks: AlarmHooks | None = None
@@ -97,10 +100,9 @@ async def run_estimation_loop(
     status.hooks, status.fit_times, status.restarts = lambda: hooks.health, lambda: fit_thread.times, counters.restarts
     if files:
         status.checkpoint = files.restore(pack)
-    restored_s = since_boot()
     if parts.edge:
         status.edge = parts.edge.health
-    totals = LifetimeTotals(pack.estimator, counters.total)
+    restored_s, totals = since_boot(), LifetimeTotals(pack.estimator, counters.total)
     publisher = Publisher(
         settings,
         pack,
@@ -118,6 +120,8 @@ async def run_estimation_loop(
     if lost_reason := saved_run.lost_reason or unrestored:
         # after the restored alarms, because the hooks announce this one
         monitor.raise_state_lost(lost_reason)
+    if parts.board_check:
+        parts.board_check.on_recalibrated = monitor.raise_state_lost
     # with a raised alarm or a lost cell the slots of the earlier run, so that a floating slot does not replace this cell
     is_known = monitor.alarms.active or monitor.alarms.unwatched_critical
     slots = CellSlots(model.cell.series_count, counters.cell_slots if is_known else (), counters.cell_slots)

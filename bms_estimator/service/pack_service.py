@@ -144,6 +144,7 @@ async def run_pack_service(
                 ServiceStatus(delivery, source.health, partial(recording_health, tap)),
                 requests,
                 source.current_zero,
+                board.board_check if board else None,
                 notifier,
                 hooks,
                 edge,

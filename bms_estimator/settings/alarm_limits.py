@@ -4,7 +4,7 @@ The sources of the default limits are in docs/pack/alarms.md.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Literal, NamedTuple
 
 from bms_estimator.model.cell import CellModel
@@ -92,6 +92,15 @@ BALANCING_BELOW_V = 0.25
 4.00 V for cells that are charged to 4.2 V."""
 
 
+PLAUSIBLE_TEMPERATURES_C: Mapping[AlarmName, tuple[float, float]] = {
+    "over_temperature": (30.0, 120.0),
+    "under_temperature": (-60.0, 40.0),
+}
+"""Ranges of plausible limits [degrees Celsius]."""
+LONG_DELAY_S = 3600.0
+"""Delay of a critical alarm above which a warning is given [s]."""
+
+
 class _Default(NamedTuple):
     """Default limit and clear level of an alarm."""
 
@@ -155,7 +164,7 @@ def balancing_voltage_v(cell: CellModel) -> float:
 
 
 def implausible_limits(settings: Settings, cell: PackModel) -> list[str]:
-    """Return a warning for each limit that lies outside the range of the cell file."""
+    """Return a warning for each implausible limit, and for each long delay of a critical alarm."""
     return list(_implausible_limits(monitored_alarms(settings, cell), cell))
 
 
@@ -169,14 +178,23 @@ def _implausible_limits(alarms: tuple[AlarmDefinition, ...], cell: PackModel) ->
         "cell_under_voltage": (c.voltage_min_v / n, nominal_v / n),
         "discharge_over_current": (0.0, c.current_max_a),
         "charge_over_current": (0.0, c.current_max_a),
+        **PLAUSIBLE_TEMPERATURES_C,
     }
     for alarm in alarms:
         low, high = ranges.get(alarm.name, (-math.inf, math.inf))
         if not low <= alarm.limit <= high:
-            key = f"alarms.{alarm.name}.limit_{'a' if alarm.kind.unit == 'A' else 'v'}"
+            unit = alarm.kind.unit or ""
+            hint = (
+                "the plausible range; is the value in degrees Fahrenheit?"
+                if alarm.name in PLAUSIBLE_TEMPERATURES_C
+                else "the range of the cell file; is the value for one cell instead of the pack, or the reverse?"
+            )
+            key = f"alarms.{alarm.name}.limit_{unit[-1:].lower()}"
+            yield f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {unit}, {hint}"
+        if alarm.severity == "critical" and alarm.delay_s > LONG_DELAY_S:
             yield (
-                f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {alarm.kind.unit}, the range of the cell file; "
-                "is the value for one cell instead of the pack, or the reverse?"
+                f"alarms.{alarm.name}.delay_s = {alarm.delay_s:g}: this critical alarm is raised only if its cause lasts "
+                "longer than an hour"
             )
 
 

@@ -10,7 +10,7 @@ import aiomqtt
 import pytest
 import structlog
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.mqtt.broker_config import check, tls_context
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.mqtt import MqttSettings
@@ -121,21 +121,26 @@ def test_relative_paths_are_found_in_the_credentials_directory_of_systemd(
 
 
 @pytest.mark.parametrize(
-    ("changes", "error"),
+    ("changes", "kind", "error"),
     [
-        ({"key_file": "foreign.key"}, r"mqtt\.key_file = .*foreign\.key: is not the key of mqtt\.cert_file = .*pack\.crt$"),
-        ({"cert_file": "none.crt"}, r"mqtt\.cert_file = .*none\.crt: cannot be read: No such file or directory$"),
-        ({"key_file": "none.key"}, r"mqtt\.key_file = .*none\.key: cannot be read: No such file or directory$"),
-        ({"cert_file": "pack.key"}, r"mqtt\.cert_file = .*pack\.key.*: must be a PEM certificate and its key"),
-        ({"key_file": "pack.crt"}, r"mqtt\.key_file = .*pack\.crt: must be a PEM certificate and its key"),
-        ({"key_file": "locked.key"}, r"mqtt\.key_file.*encrypted"),
-        ({"cert_file": None}, r"mqtt\.key_file = .*: of no use without mqtt\.cert_file$"),
-        ({"url": "mqtt://host"}, r"mqtt\.cert_file = .*: of no use without TLS: mqtt\.url must be mqtts://"),
+        ({"key_file": "foreign.key"}, TemporaryError, r"mqtt\.key_file = .*foreign\.key: is not the key of mqtt\.cert_file = .*pack\.crt$"),
+        ({"cert_file": "none.crt"}, TemporaryError, r"mqtt\.cert_file = .*none\.crt: cannot be read: No such file or directory$"),
+        ({"key_file": "none.key"}, TemporaryError, r"mqtt\.key_file = .*none\.key: cannot be read: No such file or directory$"),
+        ({"cert_file": "pack.key"}, TemporaryError, r"mqtt\.cert_file = .*pack\.key.*: must be a PEM certificate and its key"),
+        ({"key_file": "pack.crt"}, TemporaryError, r"mqtt\.key_file = .*pack\.crt: must be a PEM certificate and its key"),
+        ({"ca_file": "empty.crt"}, TemporaryError, r"mqtt\.ca_file = .*empty\.crt: no certificates can be read"),
+        ({"key_file": "locked.key"}, UserError, r"mqtt\.key_file.*encrypted"),
+        ({"cert_file": None}, UserError, r"mqtt\.key_file = .*: of no use without mqtt\.cert_file$"),
+        ({"url": "mqtt://host"}, UserError, r"mqtt\.cert_file = .*: of no use without TLS: mqtt\.url must be mqtts://"),
     ],
 )  # fmt: skip
-def test_error_names_the_unusable_certificate(folder: Path, changes: dict[str, Any], error: str) -> None:
+def test_error_names_the_unusable_certificate(
+    folder: Path, changes: dict[str, Any], kind: type[UserError], error: str
+) -> None:
     openssl("ec", "-in", folder / "pack.key", "-aes128", "-passout", "pass:word", "-out", folder / "locked.key")
+    (folder / "empty.crt").touch()
     values = {"url": "mqtts://host", "cert_file": "pack.crt", "key_file": "pack.key"} | changes
     files = {key: folder / str(name) for key, name in values.items() if key != "url" and name is not None}
-    with pytest.raises(UserError, match=error):
+    with pytest.raises(UserError, match=error) as raised:
         check(MqttSettings(url=values["url"], **files))
+    assert type(raised.value) is kind

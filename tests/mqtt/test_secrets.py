@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError
 from bms_estimator.mqtt.broker_config import check
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.command_line import run
@@ -54,5 +54,5 @@ def test_validation_error_hides_the_password(url: Any) -> None:
 
 def test_error_on_a_non_utf8_password_hides_its_bytes(tmp_path: Path) -> None:
     (tmp_path / "password").write_bytes(SECRET.encode() + b"\xff")
-    with pytest.raises(UserError, match=r"mqtt\.password_file = .*: cannot be read: not UTF-8 text$"):
+    with pytest.raises(TemporaryError, match=r"mqtt\.password_file = .*: cannot be read: not UTF-8 text$"):
         check(MqttSettings(password_file=tmp_path / "password"))

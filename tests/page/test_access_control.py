@@ -2,7 +2,7 @@
 
 import pytest
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError
 from bms_estimator.page.access_control import AccessControl, make_access_control
 from bms_estimator.settings.page import PageSettings, parse_listen
 
@@ -45,7 +45,7 @@ def test_invalid_token_is_reported(tmp_path, text, message):
     file = tmp_path / "token"
     if text is not None:
         file.write_bytes(text)
-    with pytest.raises(UserError, match=message):
+    with pytest.raises(TemporaryError, match=message):
         make_access_control(PageSettings(listen="0.0.0.0:8765", token_file=file))
 
 

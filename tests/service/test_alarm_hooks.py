@@ -26,6 +26,7 @@ from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
 from bms_estimator.telemetry.alarms.message import Change
 from tests.collector import Collector
 from tests.mosquitto import Broker, Listener
@@ -216,7 +217,10 @@ async def test_a_hook_runs_only_for_its_alarms_and_states(tmp_path: Path) -> Non
 
 async def test_after_a_program_that_hangs_the_next_alarm_is_reported(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    hang = write_program(tmp_path / "hang", f"echo $BMS_STATE >> {out}; [ $BMS_STATE = cleared ] || sleep 1000")
+    cut_name = r"printf 'batteriew\303' > /proc/$$/comm"  # the system cuts names, also within a character
+    hang = write_program(
+        tmp_path / "hang", f"{cut_name}; echo $BMS_STATE >> {out}; [ $BMS_STATE = cleared ] || sleep 1000"
+    )
     with capture_logs() as lines:
         async with run_hooks({"run": [hang], "timeout_s": 2.0}) as running:
             for count, alarm in enumerate((RAISED, CLEARED), 1):
@@ -492,6 +496,11 @@ async def test_the_arguments_of_a_program_are_neither_published_nor_logged(tmp_p
             ['relay = "high": the pin is low after each reset and without power'],
         ),
         ({"relay": "high", "when_silent": "high", "alarms": ["soc_low"]}, []),
+        (
+            {"relay": "low", "when_silent": "low", "alarms": ["cell_over_voltage", "cell_short"]},
+            ["alarms: the board measures no cell voltages"],
+        ),
+        ({"relay": "low", "when_silent": "low", "alarms": ["cell_over_voltage", "pack_over_voltage"]}, []),
         ({"run": ["true"]}, ["on: with several alarms, cleared is reported while others are still raised"]),
         ({"run": ["true"], "on": ["first_raised", "last_cleared"]}, []),
         ({"run": ["true"], "alarms": ["soc_low"]}, []),
@@ -664,3 +673,27 @@ async def test_a_lost_temperature_sensor_switches_the_relay_and_a_missing_progra
             await asyncio.wait_for(service, LONG_S)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
+
+
+async def test_a_lost_calibration_of_the_board_needs_an_acknowledgement_and_is_not_stored_before(
+    tmp_path: Path,
+) -> None:
+    """The board measures with a default slope, because its memory is damaged. The load stays disconnected."""
+    memory, sink, stop = KnownBoardFile(tmp_path, "pack"), Collector(), asyncio.Event()
+    cell = load_cell("thunder_power_6s")
+    with VirtualBoard(lambda _: Reading(1.0, 22.0, 25.0)) as board:
+        running = asyncio.create_task(board.run())
+        settings = Settings.model_validate({"sensor": {"port": board.path}, "alarms": {"hook": [{"relay": "low"}]}})
+        stop.set()
+        await run_pack_service(settings, cell, stop=stop, folder=tmp_path)  # an earlier run
+        stored = NO_BOARD | {"serial": "00000001", "volts_per_ampere": "0.04"}
+        memory.save(stored)
+        stop.clear()
+        service = asyncio.create_task(run_pack_service(settings, cell, sinks=[sink], stop=stop, folder=tmp_path))
+        snapshot = await sink.until(lambda s: any(each.active and each.name == "alarm_state_lost" for each in s.alarms))
+        assert "volts_per_ampere 0.04 to 0.1" in next(each.text for each in snapshot.alarms if each.active)
+        stop.set()
+        await service
+        running.cancel()
+        assert not board.relay_high
+    assert memory.load() == stored

@@ -1,5 +1,6 @@
 """Hooks that publish messages, with a real broker: denied topics, outages, a full outbox."""
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -8,6 +9,8 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
+from bms_estimator.mqtt.message import OnResult
+from bms_estimator.service import job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.telemetry.alarms.message import Change
@@ -78,6 +81,28 @@ async def test_the_end_of_an_alarm_whose_message_was_denied_replaces_the_message
             assert live.all("load/set") == [b"soc_low cleared"]
     finally:
         broker.stop()
+
+
+@pytest.mark.parametrize("cycles", range(10))  # in one of them, the denied job is due while the last one waits
+async def test_a_denied_message_does_not_remove_the_job_of_a_newer_alarm(
+    cycles: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_hook, "FIRST_RETRY_S", 0.0)
+    output, results = list[bytes](), list[OnResult]()
+
+    def publish(_: str, payload: bytes, on_result: OnResult) -> None:
+        output.append(payload)
+        results.append(on_result)
+
+    async with AlarmHooks([HOOK], "pack", publish, None) as hooks:
+        for count, alarm in enumerate((RAISED, CLEARED, RAISED, CLEARED), 1):
+            hooks.on_alarm_change(Change(at_s=0.0, alarm=alarm))
+            await until(lambda count=count: len(output) == count)  # type: ignore[misc]
+        results[1]("not authorized")
+        for _ in range(cycles):
+            await asyncio.sleep(0)
+        hooks.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
+    assert output == [b"soc_low raised", b"soc_low cleared"] * 2 + [b"soc_low raised"]
 
 
 async def test_a_broker_with_mqtt_3_does_not_report_a_denied_message(stopped_broker: Broker) -> None:

@@ -518,10 +518,19 @@ def test_a_clear_level_beyond_the_limit_is_rejected(alarms: dict[str, Any], reas
         monitored_alarms(settings(alarms), PACK)
 
 
-def test_a_limit_out_of_the_pack_s_range_is_reported() -> None:
+@pytest.mark.parametrize(
+    ("alarm", "rule", "start"),
+    [
+        ("cell_over_voltage", {"limit_v": 8.4}, "limit_v = 8.4: outside 3.65 to 4.5 V, the range of the cell file"),
+        ("over_temperature", {"limit_c": 140.0}, "limit_c = 140: outside 30 to 120 °C, the plausible range"),
+        ("under_temperature", {"limit_c": -273.0}, "limit_c = -273: outside -60 to 40 °C"),
+        ("pack_over_voltage", {"delay_s": 36000.0}, "delay_s = 36000: this critical alarm is raised only if"),
+    ],
+)
+def test_an_implausible_limit_or_delay_is_reported(alarm: str, rule: dict[str, float], start: str) -> None:
     assert implausible_limits(settings(), PACK) == []
-    (warning,) = implausible_limits(settings({"cell_over_voltage": {"limit_v": 8.4}}), PACK)
-    assert warning.startswith("alarms.cell_over_voltage.limit_v = 8.4: outside 3.65 to 4.5 V")
+    (warning,) = implausible_limits(settings({alarm: rule}), PACK)
+    assert warning.startswith(f"alarms.{alarm}.{start}")
 
 
 def test_limits_depend_on_chemistry_size_and_settings() -> None:

@@ -442,7 +442,7 @@ class World:
         if self.process is not None:
             source = self.process.source
             # The service drops and does not count samples beyond this limit.
-            no_room = source is not None and len(source._board_check._pending) == MAX_PENDING_READS
+            no_room = source is not None and len(source.board_check._pending) == MAX_PENDING_READS
             self.process.has_uncounted_samples |= no_room or self.cable.board is self.foreign_board
             if not self.board.text and self.process.reference.feed(data):
                 self.process.last_sample_s = self.sampled_s
@@ -506,7 +506,7 @@ class World:
         """Check that each byte was decoded or counted, and each valid sample used, or dropped and counted."""
         if process.source is None:
             return
-        board_check, counters = process.source._board_check, process.source.counters
+        board_check, counters = process.source.board_check, process.source.counters
         is_pending = board_check.pending_protocol is not None  # the samples' board is not identified yet
         if self.timeline.now_s - process.delivered_s <= DECODE_S or self._waiting_reads(process):
             return
@@ -674,8 +674,8 @@ class World:
             source = original(*arguments, **named)
             if self.process is not None:
                 self.process.source = source
-                source._board_check.on_port_opened = partial(
-                    self._discount_samples, self.process, source._board_check, source._board_check.on_port_opened
+                source.board_check.on_port_opened = partial(
+                    self._discount_samples, self.process, source.board_check, source.board_check.on_port_opened
                 )
             return source
 

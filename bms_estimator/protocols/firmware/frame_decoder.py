@@ -129,6 +129,8 @@ class FrameDecoder:
             "sample_rate_hz": str(hello.rate_hz),
             "divider": f"{hello.divider_ppm * 1e-6:g}",
             "volts_per_ampere": f"{hello.current_uv_per_a * 1e-6:g}",
+            "ratiometric": str(hello.channels >> 1 & 1),
+            "current_zero": f"{hello.current_zero_ppm * 1e-6:g}",
             "bandgap_v": f"{hello.bandgap_uv * 1e-6:g}",
         }
 

@@ -172,7 +172,7 @@ def target(settings: InfluxSettings) -> Target:
     """Return the destination of the lines. Files are reloaded each time, because they may have been replaced.
 
     Raises:
-        UserError: A file cannot be used.
+        TemporaryError: A file cannot be used, perhaps because it is being replaced.
     """
     if settings.bucket:
         query = {"bucket": settings.bucket, "org": settings.org or "", "precision": "ms"}
@@ -185,8 +185,7 @@ def target(settings: InfluxSettings) -> Target:
         try:
             context = ssl.create_default_context(cafile=settings.ca_file)
         except OSError as error:  # includes ssl.SSLError
-            kind = UserError if isinstance(error, ssl.SSLError) else TemporaryError
-            raise kind(f"influx.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
+            raise TemporaryError(f"influx.ca_file = {settings.ca_file}: no certificates can be read: {error}") from None
     headers = {"Content-Type": "text/plain; charset=utf-8"} | authorization
     return Target(f"{settings.url.rstrip('/')}{path}?{urllib.parse.urlencode(query)}", headers, context)
 
@@ -196,7 +195,9 @@ def _token_header(settings: InfluxSettings) -> dict[str, str]:
         return {}
     token = _secret("token_file", settings.token_file)
     if not token.isascii():
-        raise UserError(f"influx.token_file = {settings.token_file}: must be ASCII, because it is sent in a header")
+        raise TemporaryError(
+            f"influx.token_file = {settings.token_file}: must be ASCII, because it is sent in a header"
+        )
     return {"Authorization": f"Token {token}"}
 
 
@@ -212,16 +213,16 @@ def _secret(key: str, path: Path) -> str:
     """Read the single line of a file.
 
     Raises:
-        UserError: The file cannot be read, or is not one line of text.
+        TemporaryError: The file cannot be read, or is not one line of text.
     """
     try:
         secret = credential(path).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise TemporaryError(f"influx.{key} = {path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:  # its text would show bytes of the secret
-        raise UserError(f"influx.{key} = {path}: cannot be read: not UTF-8 text") from None
+        raise TemporaryError(f"influx.{key} = {path}: cannot be read: not UTF-8 text") from None
     if not secret.isprintable():
-        raise UserError(f"influx.{key} = {path}: must hold one line of text")
+        raise TemporaryError(f"influx.{key} = {path}: must hold one line of text")
     return secret
 
 

@@ -50,6 +50,11 @@ class BoardCheck:
         self._store_attempt_s = -math.inf
         self.pending_protocol: DeviceProtocol | None = None
         """Decoder of the pending chunks; None if no chunks are pending."""
+        self.on_recalibrated: Callable[[str], object] = lambda _: None
+        """Called with the changes when the pack's board reports another calibration, before it is stored. The firmware
+        replaces a damaged calibration by a default one."""
+        self.is_zero_commanded = False
+        """True while a command changes the zero of the current, so that its change is not reported."""
         self._pending = deque[Chunk]()
         self.rejected_bytes = 0
         """Number of bytes of other boards, of ports that were lost before their board was known, and of surplus pending chunks."""
@@ -119,19 +124,30 @@ class BoardCheck:
             return
         previous, self._known = self._known, {name: board.get(name, "") for name in STORED_FIELDS}
         if self._known != previous:
-            self._log_new_board(previous)
-            self._store_attempt_s = -math.inf
+            is_recalibrated = self._log_new_board(previous)
+            # stored later, so that a restart finds a new calibration again unless its alarm is saved
+            self._store_attempt_s = now_s if is_recalibrated else -math.inf
         self._store_board(now_s)
 
-    def _log_new_board(self, previous: Mapping[str, str]) -> None:
-        changes = [name for name in STORED_FIELDS if previous.get(name) and previous[name] != self._known[name]]
-        if changes:
-            changed = {name: f"{previous[name]} to {self._known[name]}" for name in changes}
-            log.warning(
-                "the board is calibrated differently" if "serial" not in changes else "another board", **changed
-            )
-        else:
+    def _log_new_board(self, previous: Mapping[str, str]) -> bool:
+        """Log and report changes of the board. Return True if it is the same one with another calibration."""
+        changes = {
+            name: f"{previous[name]} to {self._known[name]}"
+            for name in STORED_FIELDS
+            if previous.get(name) and previous[name] != self._known[name]
+        }
+        if self.is_zero_commanded:
+            changes.pop("current_zero", None)
+        if not changes:
             log.info("this is the pack's board from now on", **self._known)
+        elif "serial" in changes:
+            log.warning("another board", **changes)
+        else:
+            log.warning("the board is calibrated differently", **changes)
+            text = ", ".join(f"{name} {change}" for name, change in changes.items())
+            self.on_recalibrated(f"the board is calibrated differently, so that its values may be wrong: {text}")
+            return True
+        return False
 
     def _store_board(self, now_s: float) -> None:
         """Start a thread that stores the board, unless one is running or the last attempt is less than ``STORE_RETRY_S`` ago."""

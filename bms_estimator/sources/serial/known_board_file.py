@@ -9,8 +9,8 @@ import structlog
 
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 
-STORED_FIELDS = ("serial", "divider", "volts_per_ampere", "bandgap_v")
-"""Fields of a board's hello that are stored."""
+STORED_FIELDS = ("serial", "divider", "volts_per_ampere", "ratiometric", "current_zero", "bandgap_v")
+"""Fields of a board's hello that are stored: the serial number and all of the calibration."""
 NO_BOARD: Mapping[str, str] = dict.fromkeys(STORED_FIELDS, "")
 """Content of the file that makes the service accept any board as the pack's."""
 _SERIAL_PATTERN = re.compile(r"([0-9a-f]{8})?")
@@ -77,8 +77,11 @@ def _validate(content: object) -> Mapping[str, str]:
     Raises:
         ValueError: The content is not a board.
     """
-    if not isinstance(content, dict) or not all(isinstance(content.get(name), str) for name in STORED_FIELDS):
+    if not isinstance(content, dict) or "serial" not in content:
         raise ValueError("no board in it")
-    if not _SERIAL_PATTERN.fullmatch(content["serial"]):
-        raise ValueError(f"serial {content['serial'][:20]!r} is not valid")
-    return {name: content[name] for name in STORED_FIELDS}
+    board = {name: content.get(name, "") for name in STORED_FIELDS}  # a former version stored fewer fields
+    if not all(isinstance(value, str) for value in board.values()):
+        raise ValueError("no board in it")
+    if not _SERIAL_PATTERN.fullmatch(board["serial"]):
+        raise ValueError(f"serial {board['serial'][:20]!r} is not valid")
+    return board

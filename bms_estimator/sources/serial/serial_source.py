@@ -77,9 +77,10 @@ class SerialSource:
         make_protocol(settings).feed(0.0, b"\0\n")  # ends a frame, so that numba compiles the decoder now
         self._decoder = make_protocol(settings)
         has_serial_number = settings.protocol == "binary"  # other devices report no serial number
-        self._board_check = BoardCheck(
+        self.board_check = BoardCheck(
             lambda: make_protocol(settings), settings.serial or "", board_file if has_serial_number else None
         )
+        """Check that the board is the pack's."""
         self._discovery = PortDiscovery(settings.port, monotonic)
         self._port = SerialPort(
             self._find_and_open,
@@ -104,7 +105,7 @@ class SerialSource:
         """Counters of the decoder, the board check and the tap, and the number of ``reconnects``."""
         counters = {
             **self._decoder.counters,
-            "unadmitted_bytes": self._board_check.rejected_bytes,
+            "unadmitted_bytes": self.board_check.rejected_bytes,
             "reconnects": max(self._port.openings - 1, 0),
         }
         return counters if self._tap is None else counters | {"missed_reads": self._tap.missed_reads}
@@ -173,10 +174,10 @@ class SerialSource:
         if not chunk[1]:  # an empty chunk marks an opening of the port
             self._openings_read += 1
             self._decoder.on_port_opened()
-            self._board_check.on_port_opened()
+            self.board_check.on_port_opened()
             return ()
         try:
-            return self._board_check.accept(chunk, self._decoder)
+            return self.board_check.accept(chunk, self._decoder)
         except OtherBoardError as error:
             self._reject_device(f"{self._path}: refused: {error}")
             return ()
@@ -191,7 +192,7 @@ class SerialSource:
     @property
     def _current_decoder(self) -> DeviceProtocol:
         """Decoder of the device whose bytes arrived last, which may still be pending."""
-        return self._board_check.pending_protocol or self._decoder
+        return self.board_check.pending_protocol or self._decoder
 
     def _send_due(self) -> None:
         """Send the decoder's output, unless chunks from before the last opening of the port are still queued."""
@@ -213,7 +214,12 @@ class SerialSource:
         Raises:
             UserError: The board is not connected, has no such command, does not answer, or rejects the command.
         """
-        await self._run_command(lambda: self._decoder.command("current_zero"))
+        self.board_check.is_zero_commanded = True
+        try:
+            await self._run_command(lambda: self._decoder.command("current_zero"))
+            self.board_check.remember_board(self.board, self._monotonic())
+        finally:
+            self.board_check.is_zero_commanded = False
 
     @property
     def boots(self) -> int:
@@ -275,7 +281,7 @@ class SerialSource:
         Raises:
             NoPortError: There is no candidate, or it cannot be opened.
         """
-        path = self._discovery.next(self._board_check.serial)
+        path = self._discovery.next(self.board_check.serial)
         try:
             return path, open_port(path, self._settings.baud)
         except NoPortError:
@@ -286,7 +292,7 @@ class SerialSource:
         """Open the port, supervise it until it is lost, and repeat for ever."""
         while True:
             if self._rejected:  # a user may have accepted another board since then
-                self._board_check.reload_known_board()
+                self.board_check.reload_known_board()
             path = self._path = await self._port.open()
             try:
                 await self._supervise(path)
@@ -307,7 +313,7 @@ class SerialSource:
             counters = self._decoder.counters
             if counters["frames_received"] != frames:
                 last_frame_s, frames = now_s, counters["frames_received"]
-                self._board_check.remember_board(self.board, now_s)
+                self.board_check.remember_board(self.board, now_s)
             elif self._rejected:  # the reason is already reported
                 continue
             elif fault := self._current_decoder.fault:

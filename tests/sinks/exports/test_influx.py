@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.model.errors import UserError
+from bms_estimator.model.errors import TemporaryError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink
@@ -220,13 +220,13 @@ def test_invalid_settings_are_rejected(settings_values: dict[str, Any], message:
 
 
 def test_unusable_file_raises_an_error_at_start(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"influx\.token_file = .*none: cannot be read: No such file"):
+    with pytest.raises(TemporaryError, match=r"influx\.token_file = .*none: cannot be read: No such file"):
         InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "none"))
     (tmp_path / "token").write_text("t\N{EURO SIGN}ken", encoding="utf-8")
-    with pytest.raises(UserError, match=r"influx\.token_file = .*token: must be ASCII"):
+    with pytest.raises(TemporaryError, match=r"influx\.token_file = .*token: must be ASCII"):
         InfluxSink(InfluxSettings(bucket="b", token_file=tmp_path / "token"))
     (tmp_path / "ca").write_text("nonsense")
-    with pytest.raises(UserError, match=r"influx\.ca_file = .*: no certificates"):
+    with pytest.raises(TemporaryError, match=r"influx\.ca_file = .*: no certificates"):
         InfluxSink(InfluxSettings(url="https://house", bucket="b", ca_file=tmp_path / "ca"))
 
 

@@ -107,7 +107,7 @@ async def test_auto_rejects_another_board_and_reopens_its_own(only_port: Path) -
     source = SerialSource(SensorSettings(port="auto", sample_rate_hz=50), first_retry_s=0.05)
     async with run_source(source, blocks):
         async with plugged_in(only_port, serial=1):
-            await until(lambda: source._board_check.serial)
+            await until(lambda: source.board_check.serial)
         await until(lambda: source.silence_reason)
         async with plugged_in(only_port, serial=2, voltage_v=11.1):
             await until(lambda: source.silence_reason and "refused" in source.silence_reason)
@@ -124,7 +124,7 @@ async def test_auto_reports_a_board_that_prints_text_in_place_of_its_own(only_po
     source = SerialSource(SensorSettings(port="auto"), first_retry_s=0.05, silent_s=0.3)
     async with run_source(source, []):
         async with plugged_in(only_port, serial=1):
-            await until(lambda: source._board_check.serial)
+            await until(lambda: source.board_check.serial)
         await until(lambda: source.silence_reason)
         with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, symlink(only_port, other.path):
             task = asyncio.create_task(other.run())

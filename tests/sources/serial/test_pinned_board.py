@@ -31,7 +31,7 @@ from tests.serial_line import usb_port
 
 OURS_V, OTHERS_V = 22.2, 11.1
 """Voltages that the pack's board and another board measure [V]. By default they have serial numbers 1 and 2."""
-BOARD_42 = {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
+BOARD_42 = NO_BOARD | {"serial": "0000002a", "divider": "5", "volts_per_ampere": "0.1", "bandgap_v": "1.1"}
 """Stored fields of a board with serial number 42."""
 
 
@@ -154,7 +154,7 @@ async def test_other_board_plugged_into_the_adapter_of_the_open_port_is_rejected
     """The port remains open. Only the hello shows that the board was replaced."""
     port = port_folder / "ttyUSB0"
     async with source(port) as reader, board(port) as virtual:
-        await until(lambda: reader._board_check.serial)
+        await until(lambda: reader.board_check.serial)
         virtual._stored[MessageType.COMMAND_SET_SERIAL] = 2
         other_board = VirtualBoard(lambda _: Reading(current_a=0.5, voltage_v=1.0), parts=BoardParts(divider=9.0))
         virtual._converter = other_board._converter
@@ -169,7 +169,7 @@ async def test_own_board_is_found_on_another_port_among_other_boards(port_folder
     port = port_folder / "ttyUSB0"
     async with source(port, memory) as reader:
         async with board(port):
-            await until(lambda: reader._board_check.serial)
+            await until(lambda: reader.board_check.serial)
         await until(lambda: reader.silence_reason)
         blocks_before = len(reader.blocks)
         async with board(port_folder / "ttyUSB1", serial=2, voltage_v=OTHERS_V), board(port_folder / "ttyUSB2"):
@@ -209,7 +209,10 @@ async def test_search_for_the_board_sends_nothing_to_a_silent_device(port_folder
         os.close(master)
 
 
-async def test_changed_calibration_is_stored_and_logged(port_folder: Path, memory: KnownBoardFile) -> None:
+async def test_changed_calibration_is_reported_before_it_is_stored(
+    port_folder: Path, memory: KnownBoardFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(board_check, "STORE_RETRY_S", 0.05)
     port = port_folder / "ttyUSB0"
     async with source(port, memory), board(port):
         await wait_until_stored(memory, "00000001")

@@ -219,19 +219,21 @@ async def test_command_to_a_board_that_prints_text_is_rejected(line: Line) -> No
             await source.current_zero()
 
 
-async def test_samples_after_current_zero_are_decoded_with_the_new_zero() -> None:
-    blocks: list[SampleBlock] = []
+async def test_samples_after_current_zero_are_decoded_with_the_new_zero_which_is_not_reported() -> None:
+    blocks, reported = list[SampleBlock](), list[str]()
     with VirtualBoard(lambda _: STEADY) as virtual:
         async with (
             SerialSource(SensorSettings(port=virtual.path)) as source,
             run_tasks(virtual.run(), store_blocks(source, blocks)),
         ):
-            await until(lambda: sample_count(blocks) >= 20)
+            source.board_check.on_recalibrated = reported.append
+            await until(lambda: sample_count(blocks) >= 20 and source.board_check.serial)
             assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.5, abs=0.03)
             await source.current_zero()
             blocks.clear()
             await until(lambda: sample_count(blocks) >= 20)
             assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.0, abs=0.03)
+    assert reported == []
 
 
 async def test_relay_command_is_not_sent_to_a_board_that_was_reset_although_its_hello_was_damaged() -> None:
