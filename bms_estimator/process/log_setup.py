@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator, MutableMapping, MutableSequence
 from typing import Any, get_args
 
 import structlog
+from structlog.processors import ExceptionRenderer
+from structlog.tracebacks import ExceptionDictTransformer
 
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.settings.pack import LogLevel
@@ -14,6 +16,8 @@ from bms_estimator.settings.pack import LogLevel
 LEVELS: tuple[LogLevel, ...] = get_args(LogLevel)
 _levels: dict[str, LogLevel] = {}
 """Log levels by pack."""
+_exception_as_dicts = ExceptionRenderer(ExceptionDictTransformer(show_locals=False))
+"""Processor that converts an exception to dicts for JSON."""
 
 
 def configure_logs(lines: MutableSequence[str] | None = None) -> None:
@@ -24,12 +28,18 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
     """
     readable = lines is not None or (sys.stderr.isatty() and "JOURNAL_STREAM" not in os.environ)
     to_stderr = lines is None
+    # tracebacks without local variables, which may contain a password
     renderers: list[Any] = (
         [
-            structlog.dev.ConsoleRenderer(30 if to_stderr else 0, colors=to_stderr, pad_level=to_stderr)
-        ]  # width of the event
+            structlog.dev.ConsoleRenderer(
+                30 if to_stderr else 0,  # width of the event
+                colors=to_stderr,
+                pad_level=to_stderr,
+                exception_formatter=structlog.dev.plain_traceback,
+            )
+        ]
         if readable
-        else [structlog.processors.dict_tracebacks, structlog.processors.JSONRenderer()]
+        else [_exception_as_dicts, structlog.processors.JSONRenderer()]
     )
     structlog.configure(
         processors=[

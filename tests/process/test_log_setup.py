@@ -42,6 +42,23 @@ def test_lowest_level_of_all_packs_applies_and_can_change(lines: list[str]) -> N
     ]
 
 
+@pytest.mark.parametrize("is_readable", [True, False])
+def test_a_logged_exception_has_no_local_variables(
+    lines: list[str], monkeypatch: pytest.MonkeyPatch, is_readable: bool
+) -> None:
+    if not is_readable:
+        monkeypatch.setattr(log_setup, "stderr", SimpleNamespace(take=lines.append))
+        configure_logs()
+    password = "not-for-the-log".upper()
+    try:
+        int(password[:0])
+    except ValueError:
+        structlog.get_logger().exception("failed")
+    (line,) = lines
+    assert "ValueError" in line
+    assert password not in line
+
+
 def test_lines_beyond_the_queue_are_counted_as_lost_and_queued_lines_keep_their_order(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
