@@ -16,7 +16,8 @@ PROGRAM = Path(sys.executable).with_name("bms-estimator")
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int | str, str, str]:
-    """Run the command line in this process. Return exit code, stdout and stderr."""
+    """Run the command line in this process. Return exit code, stdout and stderr, without the output before."""
+    capsys.readouterr()
     with pytest.raises(SystemExit) as caught:
         main([str(argument) for argument in arguments])
     out, err = capsys.readouterr()
