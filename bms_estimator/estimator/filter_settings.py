@@ -31,9 +31,10 @@ LEARNED_FRACTION = 0.97
 PLATEAU_SLOPE_V = 0.15
 """Slope dOCV/dSOC per cell below which the OCV has a plateau [V]. There the voltage cannot distinguish an error of the curve from an
 error of the SOC, and the knees move. Only an error that is common to all SOCs is then learned."""
-LEVEL_STD_V = 2.0 * CURVE_ERROR_V
-"""Std of a measured curve [V]. If most of the curve is a plateau, the smallest std beyond this one is that of the level, in which makes
-differ (A123 26650 and ``lfp``: by 11 mV, with a std of 4 mV along the plateau)."""
+MEASURED_STD_V = 2.0 * CURVE_ERROR_V
+"""Maximum std of the OCV of a measured cell [V]. A plateau with a larger std has a level that differs between makes. The square of
+the std of this level is the square of the smallest std of the curve, less the square of this constant. The A123 26650 is 11 mV
+above ``lfp``, with a std of 4 mV along the plateau."""
 COMMON_CORRELATION = 0.9999
 """Correlation of the constant errors at two neighboring nodes of an OCV with a plateau. A correlation of 1 has no inverse."""
 CURVE_SOC = 0.3
@@ -165,7 +166,7 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
             p["curve_error_v"] = np.hypot(p["curve_error_v"], COUNT_ERROR_SOC * slope_v)
     has_plateau = slope_v.min() < PLATEAU_SLOPE_V * series
     if np.median(slope_v) < PLATEAU_SLOPE_V * series:
-        p["constant_error_v"] = math.sqrt(max(p["curve_error_v"].min() ** 2 - (LEVEL_STD_V * series) ** 2, 0.0))
+        p["constant_error_v"] = math.sqrt(max(p["curve_error_v"].min() ** 2 - (MEASURED_STD_V * series) ** 2, 0.0))
     elif not has_plateau:
         p["constant_error_v"] = math.sqrt(LEARNED_FRACTION) * p["curve_error_v"]
     p["node_correlation"] = COMMON_CORRELATION if has_plateau else NODE_CORRELATION

@@ -63,6 +63,11 @@ def use_resistances_of_mid_soc(p: np.void) -> None:
         p[name] = p[name][GRID // 2]
 
 
+def let_ocv_error_vary(p: np.void) -> None:
+    """Let the whole error of the OCV vary, so that none of it is learned."""
+    p["constant_error_v"], p["varying_error_v"] = 0.0, p["curve_error_v"]
+
+
 PARTS: dict[str, Change] = {
     "nothing": change_settings(),
     "large R (5 mV instead of 50)": change_settings(model_v=0.005),
@@ -73,8 +78,8 @@ PARTS: dict[str, Change] = {
     "R over SOC": use_resistances_of_mid_soc,
     "error outside the file's temperatures": change_settings(low_c=-100.0, high_c=200.0),
     "entropy": change_settings(per_kelvin_v=0.0),
-    "error of the OCV": change_settings(curve_error_v=0.0),
-    "learned OCV": change_settings(learned=0.0),
+    "error of the OCV": change_settings(curve_error_v=0.0, constant_error_v=0.0, varying_error_v=0.0),
+    "learned OCV": let_ocv_error_vary,
     "learned OCV and capacity": change_settings(learning_soc=0.0),
     "larger error at the knees of the OCV": change_settings(curve_soc=CURVE_SOC),
     "hysteresis": change_settings(hysteresis_v=0.0),

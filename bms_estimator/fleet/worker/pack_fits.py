@@ -19,7 +19,7 @@ from bms_estimator.fleet.fits.messages import FitRequest, FitResult, Rows, RowsP
 from bms_estimator.fleet.packs.pack_type import Bytes, PackType, bytes_of
 from bms_estimator.fleet.worker.block_result import HistoryMessage
 from bms_estimator.fleet.worker.pack_state import PACK_FIT
-from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, FREE_ROWS, HISTORY_ROW
+from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, FREE_ROWS
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import adopt_curves
 from bms_estimator.pack_model.learning import ADOPT_DELAY_S, SlowFit, fit_interval
@@ -136,7 +136,7 @@ class PackFits:
         try:
             slow_fit.adopt(fit_of_record(received))
         except Exception:  # noqa: BLE001 - a failed fit must not end the estimates of the pack
-            estimator.record[...], estimator.settings_record[...] = before
+            estimator.load_exact(*before)
             self._counters["failed_fits"] += 1
         else:
             self._fit["in_force"] = received
@@ -144,10 +144,7 @@ class PackFits:
 
     def _send_rows(self, pack_type: PackType, *, is_request: bool = False) -> None:
         """Send the completed rows, and a request for a fit of all rows so far."""
-        h = self._h
-        rows = h["rows"][: int(h["count"])].copy()
-        h["count"] = 0
-        h["rows"] = np.zeros(1, HISTORY_ROW)
+        rows = pack_type.estimator.take_rows()
         position, identity = RowsPosition(self._sequence, len(self._messages)), f"{self._pack}.{self._sequence}"
         data = encode_rows(Rows(rows, position, pack_type.state_digest))
         self._messages.append(HistoryMessage(subjects.history(self._pack), data, f"{identity}.{position.part}"))

@@ -151,9 +151,8 @@ def constant_voltage_current(
         ohm: Scratch space of shape (RESISTANCES,).
     """
     capacity_as = hypothesis_capacity(s, p, q)
-    lead_s = (
-        LEAD_S if p.node_correlation > NODE_CORRELATION else 0.0
-    )  # 0 without a plateau, and with the curves of a fit
+    # an OCV without a plateau and the curves of a fit need no lead
+    lead_s = LEAD_S if p.node_correlation > NODE_CORRELATION else 0.0
     lead_decay = math.exp(-dt_s / TAUS[LEAD_PAIR])
     surface_soc = soc - lead_s * lead_decay * x[LEAD_PAIR] / capacity_as
     rise_soc = -guess_a * (dt_s + lead_s * (1.0 - lead_decay)) / capacity_as
