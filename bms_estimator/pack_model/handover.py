@@ -36,7 +36,7 @@ MIN_SLOPE_V = 1e-3
 
 
 def use_fitted_curves(estimator: Estimator, fit: PackFit | None) -> None:
-    """Use the curves of a fit in the filter, or the curves of the cell file if ``fit`` is None."""
+    """Use the curves of a fit in the filter, or without a fit the curves of the cell file."""
     settings = cell_file = estimator.cell_file_settings
     if fit is not None:
         settings = estimator.settings_record[0]["filter"].copy()
