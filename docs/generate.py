@@ -129,7 +129,7 @@ def command(title: str, target: object, summary: str) -> Iterator[str]:
 
 def fleet_metrics() -> Iterator[str]:
     """Yield the page of the metrics of a fleet, with their labels and the kinds of events."""
-    yield "# Metrics of a fleet\n\n[Metrics](../fleet/metrics.md) explains where Prometheus reads them.\n"
+    yield "# Metrics of a fleet\n\n[Metrics](../fleet/operation.md#metrics-and-alerts) explains where Prometheus reads them.\n"
     for title, labels, metrics in (
         ("Node of the server", [], fleet_definitions.NODE),
         ("Tenant", ["tenant"], fleet_definitions.TENANT),
