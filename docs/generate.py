@@ -13,6 +13,7 @@ from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
 from bms_estimator.fleet.metrics import definitions as fleet_definitions
 from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.cells import CellsReport
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.forecast import ForecastReport
 from bms_estimator.model.payloads.health import Health
@@ -32,6 +33,7 @@ PAYLOADS: dict[str, type[Payload]] = {
     "health": Health,
     "info": Info,
     "alarm": Alarm,
+    "cells": CellsReport,
 }
 
 
