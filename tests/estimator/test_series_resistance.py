@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.thesis.adapt_steps import CaptureWithSoc, steps_2_and_3
+from bms_estimator.calibration.thesis.adapt import CaptureWithSoc, steps_2_and_3
 from bms_estimator.calibration.thesis.prediction import predict
 from bms_estimator.calibration.thesis.series_resistance import (
     LOWEST_SOC,

@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.checksum import add_checksum
-from bms_estimator.checkpoint.run_file import RunCounters
+from bms_estimator.checkpoint.run_file import RunCounters, add_checksum
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock

@@ -8,8 +8,7 @@ import typer
 
 from bms_estimator.cli.options.capture_options import CELL_HELP, CapacityAh, Force, check_output_file, name_of
 from bms_estimator.conversion.c_header import c_header
-from bms_estimator.conversion.cell_json import cell_json
-from bms_estimator.conversion.pybamm_parameters import pybamm_module
+from bms_estimator.conversion.cell_json import cell_json, pybamm_module
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell, with_name
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
