@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.identity import pack_identity
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.pack import Settings
 

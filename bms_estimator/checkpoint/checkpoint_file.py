@@ -30,7 +30,7 @@ from bms_estimator.checkpoint.arrays_file import (
 from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, Base, ChangesFile
 from bms_estimator.checkpoint.identity import observer_identity, pack_identity, without_observer
 from bms_estimator.model.arrays import fields
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.state import CHECKPOINT, REFUSED, Declared, PackState
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
 from bms_estimator.settings.pack import Settings

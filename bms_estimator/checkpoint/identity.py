@@ -6,8 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from bms_estimator.model.cell import ChenMoraOcv
-from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.pack import Settings
 
 
@@ -18,12 +17,7 @@ def pack_identity(settings: Settings, cell: PackModel) -> str:
     current. For a fuel cell, these are all parameters and the sign of the current. A changed description, tuning value
     or other setting does not change the hash.
     """
-    if isinstance(cell, FuelCellModel):  # learned parameters are stored relative to all parameters of the cell file
-        return hashlib.sha256(repr((*cell.a, settings.sensor.current_sign)).encode()).hexdigest()
-    ocv = cell.ocv
-    curve = ocv.a if isinstance(ocv, ChenMoraOcv) else (*ocv.soc, *ocv.ocv_v)
-    parts = (cell.cell.series_count, cell.cell.capacity_ah, settings.sensor.current_sign, *curve)
-    return hashlib.sha256(repr(parts).encode()).hexdigest()
+    return hashlib.sha256(repr(cell.state_basis(settings.sensor.current_sign)).encode()).hexdigest()
 
 
 def observer_identity(settings: Settings, cell: PackModel) -> str:

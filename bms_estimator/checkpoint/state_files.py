@@ -12,7 +12,7 @@ from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
 from bms_estimator.checkpoint.run_file import RunFile, SavedRun
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack.state import CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, PackState
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp

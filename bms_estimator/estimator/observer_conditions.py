@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from bms_estimator.estimator.stability_conditions import failed_conditions
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.observer import ObserverSettings
 
 LAWS_WITH_BOUNDS = ("improved", "scheme-3")

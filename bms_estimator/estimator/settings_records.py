@@ -17,8 +17,9 @@ from bms_estimator.kernels.observer.nussbaum import Nussbaum
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
-from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.monotone_cubic import MonotoneCubic
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import SCHEME_2_EPSILON, SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
 from bms_estimator.settings.sampling import EXACT, Sampling

@@ -15,7 +15,7 @@ from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock, since_boot
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.process.signals import acknowledge_on_signal
 from bms_estimator.process.stderr_writer import stderr

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from structlog.contextvars import bind_contextvars
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.state_folder import state_folder

@@ -14,7 +14,7 @@ from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.observer_conditions import observer_warnings
 from bms_estimator.estimator.settings_plausibility import implausible_settings
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.health import RecordingHealth
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.page.page_sink import Pages, PageSink

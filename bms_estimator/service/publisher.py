@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 import structlog
 
 from bms_estimator.estimator.cell_estimator import CellDeviations
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.forecast import ForecastReport
@@ -87,10 +86,7 @@ class Publisher:
         self._board: Mapping[str, str] = {}
         self._latency = Latency()
         self._forecast_s = -math.inf  # time of the last payload of the curves
-        is_battery = isinstance(cell, CellModel)
-        self._no_forecast = no_forecast(
-            "the identifier is switched off" if is_battery else "a fuel cell has no state of charge"
-        )
+        self._no_forecast = no_forecast(cell.no_forecast_reason)
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
@@ -236,7 +232,7 @@ class Publisher:
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         # only saved values, so that the next run continues from there
         self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
-        capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
+        capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:
             forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)

@@ -12,7 +12,7 @@ from bms_estimator.forecast.forecast import Forecast
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.info import Info
 from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
@@ -151,7 +151,7 @@ def make_info_payload(
         payload_version=PAYLOAD_VERSION,
         started=iso_utc(started_s),
         cell=pack.cell.name,
-        capacity_ah=pack.cell.capacity_ah if isinstance(pack, CellModel) else None,
+        capacity_ah=pack.capacity_ah,
         series_count=pack.cell.series_count,
         nominal_voltage_v=pack.cell.nominal_voltage_v,
         observer="learning" if learns else f"{settings.observer.law}, {settings.observer.nussbaum}",

@@ -6,7 +6,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve, unknown_values
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
+from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.cells import CellReport, CellsReport
 from bms_estimator.model.payloads.health import LoopHealth

@@ -7,8 +7,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.fuel_cell import load_any
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.pack_model import load_any
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings

@@ -16,7 +16,7 @@ from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
 from bms_estimator.cli.options.port_options import OtherPort
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import startup_signals
 from bms_estimator.process.state_folder import state_folder
