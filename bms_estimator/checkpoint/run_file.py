@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 import structlog
 
-from bms_estimator.model.payloads.totals import Totals
+from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.private_file import overwrite_private, read_private, write_private
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import new_totals

@@ -16,8 +16,7 @@ from typing import Any, Literal
 from pydantic import Field
 from pydantic.json_schema import GenerateJsonSchema
 
-from bms_estimator.conversion.circuit import ladder_table, ocv_table
-from bms_estimator.conversion.template import fill_template, value_lines
+from bms_estimator.conversion.circuit import fill_template, ladder_table, ocv_table, value_lines
 from bms_estimator.kernels.cell_model.open_loop import MIN_CAPACITANCE
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,

@@ -24,8 +24,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.page_sink import Pages
-from bms_estimator.process.child_process import ends_with_us
-from bms_estimator.process.nats_server_program import find_server
+from bms_estimator.process.child_process import ends_with_us, find_server
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.mqtt import MqttSettings

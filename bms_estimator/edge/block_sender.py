@@ -34,8 +34,8 @@ from bms_estimator.mqtt.denied_topics import DeniedTopics
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.queue_sender import QueueSender
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.backoff import FIRST_DELAY_S
-from bms_estimator.settings.edge import EdgeSettings
+from bms_estimator.process.tasks import FIRST_DELAY_S
+from bms_estimator.settings.exports import EdgeSettings
 from bms_estimator.store.database import RETRY_S, Database
 
 Times = NDArray[np.float64]

@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.suggestion import suggestion
+from bms_estimator.model.one_of import suggestion
 
 ELEMENTS = {
     "r_ts": (1, "amplitude_ohm", "offset_ohm"),  # (2.5)

@@ -2,16 +2,15 @@
 
 from typing import TypeVar
 
-from bms_estimator.estimator.observer_conditions import observer_warnings
 from bms_estimator.estimator.settings_plausibility import implausible_settings
+from bms_estimator.estimator.stability_conditions import observer_warnings
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.access_control import make_access_control
 from bms_estimator.process.systemd import is_for_the_service
 from bms_estimator.service.hook_check import hook_warnings
 from bms_estimator.settings.alarm_limits import implausible_limits
-from bms_estimator.settings.edge import EdgeSettings
-from bms_estimator.settings.exports import InfluxSettings
+from bms_estimator.settings.exports import EdgeSettings, InfluxSettings
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.page import PageSettings

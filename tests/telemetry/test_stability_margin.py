@@ -14,10 +14,10 @@ from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
+from bms_estimator.telemetry.alarms.sample_intervals import SampleCounts
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.stability_margin import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC
+from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 from tests.telemetry.alarm_captures import WALL_S, settings
 from tests.telemetry.published_state import published_state

@@ -9,6 +9,8 @@ Steps 2 and 3 of the thesis on captures.
 Step 2 runs the adaptive observer (Algorithm 1) and averages its parameters by (3.19), which gives a1..a12, the
 coefficients of R_ts, R_tl, C_ts and C_tl. Step 3 computes R_s by (4.2) and fits its coefficients a13..a15. Step 1, the
 fit of the open-circuit voltage to rests, is the command `ocv`. Its result is part of the given cell.
+
+Bounds of a1..a12 in the adaptive law (3.18), as printed in Table 10 of the thesis.
 """
 
 from collections.abc import Sequence
@@ -25,7 +27,6 @@ from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO
 from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
 from bms_estimator.calibration.thesis.prediction import predict
-from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
 from bms_estimator.calibration.thesis.series_resistance import (
     LOWEST_SOC,
     SeriesResistanceFit,
@@ -37,11 +38,33 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, ROOM_C, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.cell_model.rc_ladder import weak_share
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, Ladder, Resistance
+from bms_estimator.model.cell import Bounds, CellModel, Ladder, Resistance, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
+
+
+def printed_bounds(cell: CellModel) -> dict[str, Bounds]:
+    """Return the bounds and initial values of a1..a12 of Table 10, scaled from the pack of the thesis to ``cell``.
+
+    Resistances scale with the number of cells in series over the capacity, capacitances with its inverse. Exponents are
+    not scaled. No capture influences these bounds.
+    """
+    printed = load_cell("thunder_power_6s")
+    ohm_ratio = (cell.cell.series_count * printed.cell.capacity_ah) / (
+        printed.cell.series_count * cell.cell.capacity_ah
+    )
+    scaled_bounds = {}
+    for name, bounds in printed.adaptation.items():
+        element, coefficient = divmod(int(name[1:]) - 1, 3)
+        # each element has an amplitude, an exponent (1) and an offset; elements 2 and 3 are capacitances
+        factor = 1.0 if coefficient == 1 else 1.0 / ohm_ratio if element in (2, 3) else ohm_ratio
+        table = bounds.model_dump()
+        scaled = {key: factor * table[key] for key in ("upper", "lower", "initial") if table[key] is not None}
+        scaled_bounds[name] = Bounds.model_validate(table | scaled)
+    return scaled_bounds
+
 
 VOLTAGE_STEP_V = 1e-3
 """Assumed resolution of a capture's voltage [V]."""

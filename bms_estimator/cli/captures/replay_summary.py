@@ -16,8 +16,7 @@ from bms_estimator.pack.pack import Pack
 from bms_estimator.telemetry.cells import CELL_COLUMNS, make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.stability_margin import known_margin, missing_margin_reason
-from bms_estimator.telemetry.state import finite
+from bms_estimator.telemetry.state import finite, known_margin, missing_margin_reason
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import startup_signals
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.kernel_warm_up import load_kernels
-from bms_estimator.service.multi_pack_service import run_pack_services
-from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.service.pack_service import run_pack_service, run_pack_services
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.terminal.screen import LOG_LINES
 from bms_estimator.sinks.terminal.sink import TerminalSink

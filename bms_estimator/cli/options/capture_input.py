@@ -13,12 +13,11 @@ from tempfile import TemporaryDirectory
 import typer
 
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.model.charge_count import gap_warnings
+from bms_estimator.model.charge_count import TimeFaults, gap_warnings
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress, no_progress
 from bms_estimator.model.sample import CurrentSign, SampleBlock
-from bms_estimator.model.time_faults import TimeFaults
 from bms_estimator.sources.captures.replay import Capture, open_capture, read_samples
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 

@@ -23,12 +23,11 @@ from typing import Any, NamedTuple, Self
 import structlog
 
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.process.backoff import FIRST_DELAY_S, Backoff
+from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.process.systemd import credential
+from bms_estimator.process.tasks import FIRST_DELAY_S, Backoff
 from bms_estimator.settings.exports import InfluxSettings
 
 STATE = "bms_state"

@@ -27,10 +27,9 @@ from bms_estimator.mqtt.message import Message, OnResult
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.queue_sender import QueueSender
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.backoff import FIRST_DELAY_S
+from bms_estimator.process.tasks import FIRST_DELAY_S
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.mqtt import HomeAssistantSettings, MqttSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.requests import MAX_SHOWN, RequestDispatcher
 from bms_estimator.store.outbox import Outbox

@@ -23,7 +23,7 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.pack_model import load_any
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.parameters import ParameterReport
+from bms_estimator.model.payloads.snapshot import ParameterReport
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings

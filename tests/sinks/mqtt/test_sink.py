@@ -23,7 +23,7 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING, ReceiveQueue
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.backoff import MAX_DELAY_S
+from bms_estimator.process.tasks import MAX_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import CORRECTION_S, MqttSink
