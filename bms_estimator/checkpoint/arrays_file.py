@@ -1,6 +1,6 @@
-"""Files of arrays beside the checkpoint of the same pack: the history with its last fit, and the observed load.
+"""Files of arrays beside the checkpoint of the same pack, and the identities by which both belong to a pack.
 
-Identities of a checkpoint: hashes of the pack and of the settings that its state depends on.
+The files have the history with its last fit, and the observed load.
 """
 
 import contextlib

@@ -1,9 +1,7 @@
 """All files of a pack's state: checkpoint, history with its last fit, observed load, and counters with alarms.
 
-Checkpoint files with the estimator's state. A state is restored only if it is valid and belongs to the pack.
-
-Each ``pack_identity`` has its own file with named fields. Therefore no state is lost if settings are edited or a version
-with other fields is installed.
+A state is restored only if it is valid and belongs to the pack. Each ``pack_identity`` has its own checkpoint with named
+fields. Therefore no state is lost if settings are edited or a version with other fields is installed.
 """
 
 import contextlib

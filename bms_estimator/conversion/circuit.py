@@ -1,7 +1,4 @@
-"""Equivalent circuit of a cell as tables: open-circuit voltage and RC ladder.
-
-Templates of exported files, in the folder ``templates``.
-"""
+"""Equivalent circuit of a cell as tables: open-circuit voltage and RC ladder; and the templates of exported files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,8 +1,7 @@
 """Demo: broker, simulated board and the real service.
 
-The estimator starts with a wrong SOC and converges to the true one.
-
-MQTT broker of the demo: a nats-server on loopback without passwords. Its data are deleted when it ends.
+The estimator starts with a wrong SOC and converges to the true one. The broker is a nats-server on loopback without
+passwords, whose data are deleted when it ends.
 """
 
 import asyncio

@@ -1,8 +1,6 @@
-"""Conversion of typed settings to the settings records of the kernels.
+"""Conversion of typed settings, and of a fuel cell's file, to the settings records of the kernels.
 
 Numbers in parentheses are equations of the thesis.
-
-Settings record of the learning law from a fuel cell's file.
 """
 
 import math

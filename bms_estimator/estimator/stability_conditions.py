@@ -1,6 +1,4 @@
-"""Conditions of Lemma 4.1.1 of the thesis, under which C_ts and C_tl stay positive during adaptation.
-
-Warnings about settings of the observer that violate conditions of the thesis.
+"""Conditions of Lemma 4.1.1 of the thesis, under which C_ts and C_tl stay positive, and warnings if settings violate them.
 
 Numbers in parentheses are equations of the thesis.
 """

@@ -1,10 +1,8 @@
-"""Observed load since the last long charge, second by second.
-
-Uncertainty of the mean future load, from the variation of the observed load (method of batch means).
+"""Observed load since the last long charge, second by second, and the uncertainty of its future mean.
 
 The mean current of a load varies from trip to trip. How far the future mean may differ from the observed one depends on the number
 and the differences of the batches that were observed: a long homogeneous load has a narrow distribution, and two different trips
-have a wide one.
+have a wide one. This is the method of batch means.
 """
 
 import math

@@ -1,7 +1,4 @@
-"""Charge by the integral of a sampled current, (2.1) of the thesis.
-
-Faults of a capture's time: steps back and gaps.
-"""
+"""Charge by the integral of a sampled current, (2.1) of the thesis, and faults of the times: steps back and gaps."""
 
 import math
 

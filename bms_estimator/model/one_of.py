@@ -1,7 +1,4 @@
-"""Validation of a string by a list of names that is available only at run time.
-
-Suggestion of the name that a misspelled name probably stands for.
-"""
+"""Validation of a string by a list of names that is available only at run time, with the name probably meant."""
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass

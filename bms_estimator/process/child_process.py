@@ -1,7 +1,4 @@
-"""Child processes that end with their parent, even after a SIGKILL.
-
-Search for the nats-server program, and check of its version.
-"""
+"""Child processes that end with their parent, even after a SIGKILL, and the search for the nats-server program."""
 
 import ctypes
 import os

@@ -1,6 +1,6 @@
-"""Reliable cancellation of tasks: some libraries, and wait_for of Python 3.11, may swallow a cancellation.
+"""Reliable cancellation of tasks, and delays before retries.
 
-Delays before retries.
+Some libraries, and wait_for of Python 3.11, may swallow a cancellation.
 """
 
 import asyncio

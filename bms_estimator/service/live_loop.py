@@ -1,6 +1,6 @@
 """Live loop that passes samples from the source to the estimator, and estimates to the sinks.
 
-Thread that fits the pack's model, so that a fit delays neither samples nor messages.
+A thread fits the pack's model, so that a fit delays neither samples nor messages.
 """
 
 import asyncio

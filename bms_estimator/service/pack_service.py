@@ -1,6 +1,6 @@
-"""Service of one pack, for ``bms-estimator run``: source, estimator, broker, checkpoint, signals.
+"""Service of one pack or several packs, for ``bms-estimator run``: source, estimator, broker, checkpoint, signals.
 
-Several packs in one process, which share the event loop; each has its own source and broker connection.
+Several packs share the event loop; each has its own source and broker connection.
 """
 
 import asyncio

@@ -1,7 +1,4 @@
-"""``[influx]`` and ``[prometheus]``: exports besides MQTT.
-
-``[edge]``: sending of raw samples to a fleet's server, in blocks.
-"""
+"""``[influx]`` and ``[prometheus]``: exports besides MQTT; ``[edge]``: raw samples to a fleet's server, in blocks."""
 
 from pathlib import Path
 from typing import Annotated, ClassVar, Self

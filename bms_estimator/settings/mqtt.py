@@ -1,7 +1,4 @@
-"""``[mqtt]``: broker, topics and allowed commands.
-
-``[home_assistant]``: entities of a pack in Home Assistant.
-"""
+"""``[mqtt]``: broker, topics and allowed commands; ``[home_assistant]``: entities of a pack in Home Assistant."""
 
 from typing import Annotated, Literal
 

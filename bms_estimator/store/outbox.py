@@ -3,8 +3,6 @@
 While the broker acknowledges messages promptly, nothing is written to disk. While the broker is disconnected or
 behind, queued messages are written every ``FLUSH_S``, and only a page of them stays in memory. ``kill -9`` loses at
 most the messages since the last write; a clean shutdown loses none.
-
-Transactions of the outbox on its table.
 """
 
 import asyncio

@@ -1,7 +1,4 @@
-"""Payload of the topic ``health``: state of the service and of the source.
-
-Part of the topic ``health`` about the fit of the pack's model.
-"""
+"""Payload of the topic ``health``: state of the service, of the source and of the fit of the pack's model."""
 
 import math
 import os

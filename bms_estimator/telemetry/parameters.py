@@ -1,9 +1,7 @@
 """Payload of the topic ``parameters``: a1..a21 and the circuit elements.
 
-Each value has its std, its source, and the reason if the value is not valid. Numbers in parentheses are equations of the
-thesis.
-
-Parameters a16..a21 of (2.10) of the thesis, fitted to the OCV table of a cell file.
+Each value has its std, its source, and the reason if the value is not valid. a16..a21 are fitted to the OCV table of a cell
+file. Numbers in parentheses are equations of the thesis.
 """
 
 import math

@@ -1,9 +1,4 @@
-"""Payloads of the topics ``state`` and ``info``.
-
-Payload of the topic ``forecast``, and the fields of the topic ``state`` that a forecast supplies.
-
-Stability margin, and the reason for its absence.
-"""
+"""Payloads of the topics ``state``, ``info`` and ``forecast``."""
 
 import math
 from collections.abc import Mapping

@@ -1,7 +1,4 @@
-"""Weakest cell of a pack: by the cell voltages, or without them by the voltage of the bank.
-
-Remaining charge at the present state.
-"""
+"""Weakest cell of a pack: by the cell voltages, or without them by the voltage of the bank; and the remaining charge."""
 
 import math
 from typing import Any, Literal, NamedTuple

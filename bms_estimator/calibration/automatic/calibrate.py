@@ -1,9 +1,8 @@
 """Calibration of a cell: capacity, open-circuit voltage with hysteresis, resistances, and a validation.
 
 These are the steps of the commands ``capacity``, ``ocv``, ``identify`` and ``validate``. The first fit omits the data that are
-held back, on which it is then validated. The second fit uses all captures, and is the result.
-
-Warnings about given values that the captures contradict: the chemistry and the rated capacity.
+held back, on which it is then validated. The second fit uses all captures, and is the result. Captures that contradict the
+given chemistry or rated capacity give warnings.
 """
 
 from collections.abc import Callable, Sequence

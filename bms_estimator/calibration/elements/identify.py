@@ -1,10 +1,8 @@
 """Identification of a cell from captures: RC ladder, a1..a15 of two equivalent RC pairs, corrected OCV.
 
-``ladder_fit`` fits the resistances. The result is scored by replays of the estimator that start in mid-load, with the
-given and with the identified cell. If other captures at about the temperature of a capture were given, the replays of
-that capture use a fit without it (hold-out).
-
-Variant of the identification, with a corrected or with the given OCV.
+``ladder_fit`` fits the resistances, once with a corrected and once with the given OCV. The result is scored by replays of the
+estimator that start in mid-load, with the given and with the identified cell. If other captures at about the temperature of
+a capture were given, the replays of that capture use a fit without it (hold-out).
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,16 +1,10 @@
 """Calibration of a1..a15 by the procedure of the thesis "Adaptive Estimation of Li-ion Battery Model Parameters".
 
 a1..a15 are the coefficients of the elements of Chen and Mora's model: three for each of R_ts, R_tl, C_ts, C_tl and R_s
-as functions of SOC, (2.5)-(2.9) of the thesis. Step 1, the OCV, is part of the given cell. Step 2 is the adaptive
-observer for a1..a12, step 3 the fit of R_s, a13..a15. The result is scored by the replays of `identify`.
-
-Steps 2 and 3 of the thesis on captures.
-
-Step 2 runs the adaptive observer (Algorithm 1) and averages its parameters by (3.19), which gives a1..a12, the
-coefficients of R_ts, R_tl, C_ts and C_tl. Step 3 computes R_s by (4.2) and fits its coefficients a13..a15. Step 1, the
-fit of the open-circuit voltage to rests, is the command `ocv`. Its result is part of the given cell.
-
-Bounds of a1..a12 in the adaptive law (3.18), as printed in Table 10 of the thesis.
+as functions of SOC, (2.5)-(2.9) of the thesis. Step 1, the fit of the open-circuit voltage to rests, is the command `ocv`;
+its result is part of the given cell. Step 2 runs the adaptive observer (Algorithm 1) and averages its parameters by (3.19),
+which gives a1..a12. Step 3 computes R_s by (4.2) and fits its coefficients a13..a15. The result is scored by the replays
+of `identify`.
 """
 
 from collections.abc import Sequence

@@ -1,9 +1,4 @@
-"""``bms-estimator cell``: commands that write a cell, from a learned state or in another format.
-
-``bms-estimator cell export``: cell file from the learned state of a pack's service.
-
-``bms-estimator cell convert``: a cell file in the format of another program.
-"""
+"""``bms-estimator cell``: ``export`` writes a cell file from the learned state, ``convert`` another program's format."""
 
 import json
 import math

@@ -1,9 +1,4 @@
-"""Table on stdout.
-
-Number with its noun, for the output of commands.
-
-Status line of a command that waits.
-"""
+"""Output of commands: a table, a number with its noun, and the status line of a command that waits."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext

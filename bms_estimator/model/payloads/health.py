@@ -1,9 +1,4 @@
-"""Payload of the topic ``health``.
-
-Totals over restarts, part of the topic ``health``.
-
-State of the fit of the pack's model, part of the topic ``health``.
-"""
+"""Payload of the topic ``health``, with the totals over restarts and the state of the fit of the pack's model."""
 
 from typing import Annotated, Literal
 

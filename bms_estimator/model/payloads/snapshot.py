@@ -1,14 +1,6 @@
-"""Payloads of one publication.
+"""Payloads of one publication: those of the topics ``forecast``, ``cells``, ``info``, ``alarm/<name>`` and ``parameters``.
 
-Payload of the topic ``forecast``.
-
-Payload of the topic ``cells``.
-
-Payload of the topic ``info``.
-
-Payload of the topics ``alarm/<name>``.
-
-Payload of the topic ``parameters``.
+``estimate`` and ``health`` define the two other ones.
 """
 
 from typing import Literal, NamedTuple

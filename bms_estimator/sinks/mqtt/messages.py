@@ -1,9 +1,8 @@
 """Builder of MQTT messages from a snapshot and the state already published. Pure: no connection, no clock.
 
-Selection of values for Home Assistant. A value is published if it has changed enough and its minimum interval has passed.
-
-Home Assistant's recorder writes a row for each published value. Therefore this module limits the number of values a
-minute. If more entities change, those published longest ago come first.
+A value for Home Assistant is published if it has changed enough and its minimum interval has passed. Home Assistant's
+recorder writes a row for each published value. Therefore the number of values a minute is limited. If more entities
+change, those published longest ago come first.
 """
 
 import json

@@ -2,11 +2,7 @@
 
 ``publish`` queues states and events in the outbox and keeps the last snapshot; tasks send both, so that the event loop
 never waits for the broker. ``messages`` builds the messages, ``requests`` handles requests, ``mqtt.reconnect_loop``
-connects.
-
-Monitor of the availability topics of the service and of its pack's sensor.
-
-The monitor detects and corrects messages that other clients publish on these topics.
+connects. A monitor corrects messages of other clients on the availability topics of the service and of its sensor.
 """
 
 import asyncio

@@ -1,7 +1,5 @@
 """Serial port that is opened with pyserial, read by the event loop, and reopened when it is lost, for any protocol.
 
-Choice of the port to open.
-
 If the serial number of the board is unknown, only the configured port is opened. If the number is known, all ports with one
 of the usual USB-serial chips are also candidates, because the board may have been moved to another port.
 """

@@ -1,6 +1,6 @@
 """All alarms of a pack: their states, causes, payloads and changes.
 
-Alarms that cannot be watched, because a quantity that they need is no longer measured.
+An alarm cannot be watched if a quantity that it needs is no longer measured.
 """
 
 import math

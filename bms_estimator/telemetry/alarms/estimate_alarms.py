@@ -1,7 +1,4 @@
-"""Alarms on estimates: SOC, stability margin, model and time to the cut-off.
-
-Alarms on single cells: self-discharge, wrong readings, and a weak cell in a bank.
-"""
+"""Alarms on estimates: SOC, stability margin, model, time to the cut-off, and single cells."""
 
 import math
 

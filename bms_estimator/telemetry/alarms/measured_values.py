@@ -1,7 +1,4 @@
-"""Values that alarms on measured quantities compare with their limits.
-
-Buffer of samples for the alarms.
-"""
+"""Values that alarms on measured quantities compare with their limits, from a buffer of samples."""
 
 import math
 from typing import Any, NamedTuple

@@ -1,7 +1,4 @@
-"""Messages about an alarm: its payload and its changes.
-
-Text of an alarm in its payload.
-"""
+"""Messages about an alarm: its payload with a text, and its changes."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple

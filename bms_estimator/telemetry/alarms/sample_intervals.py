@@ -1,7 +1,4 @@
-"""Intervals between samples, with and without gaps.
-
-Fraction of samples that are lost or unusable, the value of the alarm ``sensor_fault``.
-"""
+"""Intervals between samples, with and without gaps, and the fraction of faulty samples, for the alarm ``sensor_fault``."""
 
 import math
 from dataclasses import dataclass
