@@ -11,13 +11,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.identity import pack_identity
+from bms_estimator.checkpoint.arrays_file import pack_identity
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack_model.learning import FIT_INTERVAL_S, SlowFit
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.charge_limits import NO_LIMITS

@@ -8,7 +8,7 @@ from bms_estimator.edge.block import Block
 from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.fleet.worker.pack_state import MAX_CELLS, UnpackedRecord
-from bms_estimator.model.payloads.cells import CellsReport
+from bms_estimator.model.payloads.snapshot import CellsReport
 from bms_estimator.model.sample import CellBlock
 from bms_estimator.telemetry.cells import make_cells_payload, weakest_cell_fields
 
