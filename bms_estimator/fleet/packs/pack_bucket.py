@@ -52,6 +52,7 @@ class PackBucket:
         self._next_sequence = {PACKS_BUCKET: 1, CELLS_BUCKET: 1}
         self._created: dict[str, object] = {}  # creation times of the streams with these sequence numbers
         self._changed: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
+        self._read_keys: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}  # also those of removed rows
 
     async def refresh(self) -> set[str]:
         """Read the changes since the last call, and return the affected packs. The first call reads everything.
@@ -66,21 +67,33 @@ class PackBucket:
         return changed
 
     async def _read(self, bucket: str, set_value: Callable[[str, bytes | None], bool]) -> None:
-        """Read the changed keys of a bucket. They remain in ``_changed`` for the next refresh if this refresh fails."""
+        """Read the changed keys of a bucket. They remain in ``_changed`` for the next refresh if this refresh fails.
+
+        A bucket with fewer keys than were read is read from its beginning: an erasure has purged some (``purge_keys``).
+        """
         try:
             info = await self._nc.jetstream().stream_info(_stream(bucket))
         except nats.errors.Error as error:
             raise StreamError(f"the server rejects reading {_stream(bucket)}: {error_text(error)}") from None
-        is_recreated = info.created != self._created.get(bucket)
-        if is_recreated or info.state.last_seq + 1 < self._next_sequence[bucket]:  # numbers are used again
-            self._next_sequence[bucket] = 1
-        self._created[bucket] = info.created
-        async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next_sequence[bucket]):
+        first, known = self._next_sequence[bucket], self._read_keys[bucket]
+        is_other = (
+            info.created != self._created.get(bucket) or info.state.last_seq + 1 < first
+        )  # numbers are used again
+        is_purged = not is_other and info.state.messages < len(known)
+        if is_other or is_purged:
+            first = 1
+        found = set[str]()
+        async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=first):
             for message in batch:
                 key, data = _entry(bucket, message)
+                found.add(key)
                 if set_value(key, data):
                     self._changed[bucket].add(key)
             self._next_sequence[bucket] = batch[-1].sequence + 1
+        if is_purged:
+            self._changed[bucket] |= {key for key in known - found if set_value(key, None)}
+        self._read_keys[bucket] = found if first == 1 else known | found
+        self._created[bucket] = info.created
 
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
         """Poll for changes until cancelled; call ``changed`` with the packs whose row or cell has changed.
@@ -151,6 +164,16 @@ async def remove_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
         StreamError: The server does not respond or rejects the request.
     """
     await put(nc, bucket, dict.fromkeys(keys, b""), {"KV-Operation": "DEL"})
+
+
+async def purge_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
+    """Remove keys and the marks of their removal from a bucket. Readers of the bucket then read it from its beginning.
+
+    Raises:
+        nats.js.errors.APIError: The server rejects the request.
+    """
+    for key in keys:
+        await nc.jetstream().purge_stream(_stream(bucket), subject=_key(bucket, key))
 
 
 async def put(

@@ -37,7 +37,8 @@ def _erase_from_file(file: Path, packs: Collection[str]) -> int:
         rows.create_view("rows")
         parameters = {"packs": list(packs)}
         counts = "SELECT count(*), count(*) FILTER (pack IN (SELECT unnest($packs))) FROM rows"
-        total, erased = database.execute(counts, parameters).fetchone() or (0, 0)
+        # fetchall: an open result blocks the connection
+        ((total, erased),) = database.execute(counts, parameters).fetchall()
         if not erased:
             return 0
         if erased == total:
