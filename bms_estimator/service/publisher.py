@@ -124,6 +124,15 @@ class Publisher:
             step: Result of the samples.
             cells_fault: Reason why the cell voltages cannot be used (``CellSlots.fault``); empty if they can.
         """
+        self.add_estimates(received, step)
+        self.add_to_alarms(received, step, cells_fault)
+
+    def add_estimates(self, received: ReceivedSamples, step: Step) -> bool:
+        """Do the first part of ``add``. Return True if it has published a snapshot.
+
+        The alarms follow in ``add_to_alarms``, so that their evaluation does not delay the estimate. The first snapshot follows
+        there, too, because it lists the alarms that the first samples permit.
+        """
         if self._status.source_health:
             self._latency.add(self._status.source_health().block_age_s)
         now_s, trace = self._clock.monotonic(), step.trace
@@ -134,11 +143,16 @@ class Publisher:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
         elif self._drop_reason is not None:
             self._drop_reason, self._dropped_before = None, self._dropped()
-        is_due = now_s >= self._due_s
-        if is_due and self.latest:  # before the alarms, so that their evaluation does not delay the estimate
-            self._publish_snapshot(now_s)
+        if now_s < self._due_s or not self.latest:
+            return False
+        self._publish_snapshot(now_s)
+        return True
+
+    def add_to_alarms(self, received: ReceivedSamples, step: Step, cells_fault: str = "") -> None:
+        """Do the second part of ``add``, after ``add_estimates``."""
+        now_s = self._clock.monotonic()
         alarm_changed = self.alarm_monitor.add(received, step, now_s, cells_fault)
-        if is_due and not self.latest:  # the first snapshot lists the alarms that the first samples permit
+        if not self.latest and now_s >= self._due_s:
             self.publish()
         elif alarm_changed:
             self._pass_to_sinks(self.snapshot._replace(estimate=None, alarms=self.alarm_monitor.report))
