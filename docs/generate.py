@@ -15,7 +15,7 @@ from bms_estimator.fleet.metrics import definitions as fleet_definitions
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.payload import Payload
-from bms_estimator.model.payloads.snapshot import Alarm, ForecastReport, Info, ParameterReport
+from bms_estimator.model.payloads.snapshot import Alarm, CellsReport, ForecastReport, Info, ParameterReport
 from bms_estimator.reports.thesis.report import build
 from bms_estimator.reports.thesis.report_items import Table
 from bms_estimator.reports.thesis.report_items import name as item_name
