@@ -6,18 +6,18 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import typer
+from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.forecast import ForecastReport
+from bms_estimator.model.payloads.info import Info
+from bms_estimator.model.payloads.parameters import ParameterReport
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
 from bms_estimator.fleet.metrics import definitions as fleet_definitions
-from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.forecast import ForecastReport
 from bms_estimator.model.payloads.health import Health
-from bms_estimator.model.payloads.info import Info
-from bms_estimator.model.payloads.parameters import ParameterReport
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.reports.thesis.report import build
 from bms_estimator.reports.thesis.report_items import Table

@@ -13,8 +13,7 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.thesis.claims import CLAIMS, Claim, Result, claim
-from bms_estimator.reports.thesis.experiment import Experiment, Recorded
+from bms_estimator.reports.thesis.experiment import CLAIMS, Claim, Experiment, Recorded, Result, claim
 from bms_estimator.reports.thesis.experiment_figures import FIGURES
 from bms_estimator.reports.thesis.procedure import Capture, Kind, Procedure, kind_of, printed_bounds
 from bms_estimator.reports.thesis.report_items import Reproduction
