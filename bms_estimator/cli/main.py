@@ -73,6 +73,10 @@ COMMANDS = {
     "capacity": LazyCommand(
         "bms_estimator.cli.cell.capacity:capacity", "Measure a cell's capacity from rests and the charge between them."
     ),
+    "accuracy": LazyCommand(
+        "bms_estimator.cli.cell.accuracy:accuracy",
+        "Compute how well the SOC of a pack can be known in its use, and which change helps most.",
+    ),
     "cell": LazyCommand(
         "bms_estimator.cli.cell.commands:app",
         "Write a cell file from a pack's learned state, or convert a cell file for PyBaMM, JSON or C.",
