@@ -20,7 +20,6 @@ from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import make_cells_payload
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.health import (
     dropped_text,
     make_health_payload,
@@ -28,7 +27,7 @@ from bms_estimator.telemetry.health import (
     pack_model_health,
     sample_counters,
 )
-from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals, new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
 from bms_estimator.telemetry.rest_detector import RestDetector

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from bms_estimator.model.payloads.health import EdgeHealth, HookHealth, RecordingHealth
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.sources.source import SourceHealth
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.health import NO_FIT, FitTimes
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
 
 
 @dataclass

@@ -54,8 +54,8 @@ from bms_estimator.sources.captures.replay import RawCapture, Replay, no_samples
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.cells import cell_columns
-from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
+from bms_estimator.telemetry.state import CUTOFF_FIELDS, cutoff_text
 
 CELLS_S = 10.0
 """Interval at which the columns of the cells are updated [s]. It equals the averaging window of the cell estimator."""
