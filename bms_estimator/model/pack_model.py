@@ -1,6 +1,4 @@
-"""Model of a pack of batteries or of fuel cell stacks: the only place that decides which of both a file describes, and the writer of
-cell files.
-"""
+"""Model of a pack: the only place that decides between batteries and fuel cell stacks, and the writer of cell files."""
 
 from collections.abc import Sequence
 from pathlib import Path
