@@ -12,8 +12,7 @@ from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealt
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info, Snapshot
 from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.latency import Latency
-from bms_estimator.service.service_status import ServiceStatus
+from bms_estimator.service.service_status import Latency, ServiceStatus
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
@@ -29,8 +28,7 @@ from bms_estimator.telemetry.health import (
 )
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals, new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.publish_window import Window, WindowSummary
-from bms_estimator.telemetry.rest_detector import RestDetector
+from bms_estimator.telemetry.publish_window import RestDetector, Window, WindowSummary
 from bms_estimator.telemetry.state import make_forecast_payload, make_info_payload, make_state_payload, no_forecast
 from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 

@@ -53,8 +53,8 @@ from bms_estimator.reports.report_page import ReportPage
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.captures.replay import Capture, open_capture
 from bms_estimator.sources.captures.tables.layout import ColumnMap
+from bms_estimator.store.history import MINUTE_S, Minute
 from bms_estimator.store.history_reader import HistoryReader
-from bms_estimator.store.minute import MINUTE_S, Minute
 
 CAPACITY = "capacity [Ah]"
 """Name of the learned capacity."""
