@@ -25,7 +25,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
+from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 
 CELL = "chen_mora"
 """Cell file of the warm-up. Any file would do, because the kernels do not depend on the cell."""

@@ -7,16 +7,30 @@ import sys
 from collections.abc import Callable
 
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from bms_estimator.cli.options.bar import new_bar
-from bms_estimator.service.kernel_compilation import Progress, compile_kernels, is_compiled
+from bms_estimator.service import kernel_compilation
+from bms_estimator.service.kernel_compilation import compile_kernels, is_compiled
 
+BAR_WIDTH = 24
+"""Width of the bar [characters]. With a long label, the line fits into 80 columns."""
 COMPILE_TEXT = (
     "compiling the kernels; this takes a minute, or several on a small machine, and later starts use the cache"
 )
 """Line on a stderr that is not a terminal."""
 COMPILE_LABEL = "compiling kernels"
 """Label of the bar."""
+
+
+def new_bar(console: Console) -> Progress:
+    """Return a bar that disappears at its end. It writes nothing if the console is not a terminal."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(BAR_WIDTH),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
 
 
 def compile_ahead(report: Callable[[str], object] | None = None) -> None:
@@ -36,7 +50,7 @@ def compile_ahead(report: Callable[[str], object] | None = None) -> None:
     with new_bar(console) as bar:
         task = bar.add_task(COMPILE_LABEL, total=None)
 
-        def update(progress: Progress) -> None:
+        def update(progress: kernel_compilation.Progress) -> None:
             label = f"{COMPILE_LABEL}: {progress.kernels} of {progress.all_kernels}"
             bar.update(task, description=label, total=progress.all_cpu_s, completed=progress.cpu_s)
 
