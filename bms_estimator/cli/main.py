@@ -112,6 +112,9 @@ COMMANDS = {
     "uninstall": LazyCommand(
         "bms_estimator.cli.settings.install:uninstall_command", "Remove the service from this machine."
     ),
+    "compile": LazyCommand(
+        "bms_estimator.cli.settings.compile:compile_command", "Compile the kernels, so that no later start does."
+    ),
     "config": LazyCommand("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
 }
 
