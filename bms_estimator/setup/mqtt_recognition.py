@@ -10,6 +10,7 @@ import numpy as np
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.settings.sources.mqtt import MqttSource, ValueLocation
 from bms_estimator.settings.sources.mqtt_profiles import DISCHARGE, PROFILES, ProfileName
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice, values_text
 from bms_estimator.sources.mqtt.payload_value import InvalidValueError, read_cells, read_value
 
@@ -62,14 +63,14 @@ class PublisherRecognition:
                 if template.quantity == "voltage":
                     self._topics[publisher] = topic
 
-    def devices(self, broker: str) -> list[FoundDevice]:
+    def devices(self, broker: BrokerLogin) -> list[FoundDevice]:
         """Return the publishers of voltage and current, those with the most values first.
 
         A topic may be part of several profiles. For each voltage topic the publisher with the most values is returned;
         publishers with equally many values are all returned.
 
         Args:
-            broker: URL of the broker that sent the messages.
+            broker: Broker that sent the messages.
         """
         complete = {p: values for p, values in self._values.items() if {"voltage", "current"} <= values.keys()}
         value_counts = dict[str, int]()  # number of values of the best publisher, by voltage topic
@@ -129,7 +130,7 @@ def _values(template: _Template, publisher: Publisher, topic: str, payload: byte
         return {}
 
 
-def _device(publisher: Publisher, values: Mapping[str, float], broker: str) -> FoundDevice:
+def _device(publisher: Publisher, values: Mapping[str, float], broker: BrokerLogin) -> FoundDevice:
     profile = PROFILES[publisher.profile]
     source = {"kind": "mqtt", "profile": publisher.profile}
     for key in ("prefix", "instance"):
@@ -141,7 +142,7 @@ def _device(publisher: Publisher, values: Mapping[str, float], broker: str) -> F
     cells = int(is_live(np.array([v for key, v in values.items() if key.startswith("cell ")])).sum())
     return FoundDevice(
         name=name,
-        description=f"{MqttSource.model_validate(source).short_description}, {broker}",
+        description=f"{MqttSource.model_validate(source).short_description}, {broker.url}",
         tables={"source": source},
         cells=cells or None,
         values=values_text(values["voltage"], sign * values["current"]),

@@ -10,10 +10,9 @@ from pydantic import BaseModel, ValidationError
 from bms_estimator.estimator.settings_plausibility import MAX_CAPACITY_AH
 from bms_estimator.model.cell import generic_cells, shipped_cells
 from bms_estimator.model.config_file import error_reason, without_secrets
-from bms_estimator.mqtt.broker_config import parse_url
-from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DEVICE_NAME, PackSettings
 from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
+from bms_estimator.setup.broker_login import FORM, BrokerLogin
 from bms_estimator.setup.series_count import cell_voltages, possible_counts, suggest_count
 
 CHEMISTRIES: Mapping[str, str] = {
@@ -131,15 +130,20 @@ def _parse_max_charge(text: str, _: Answers) -> object:
     return None if text == NO_LIMIT else _validated(PackSettings, "max_charge_a", parse_number(text, "A"))
 
 
-def _parse_broker(text: str, _: Answers) -> object:
+def _parse_broker(text: str, answers: Answers) -> object:
     if text == NO_BROKER:
-        return ""
-    url = _validated(MqttSettings, "url", text)
+        return None
     try:
-        parse_url(text)
+        login = BrokerLogin.parse(text)
     except ValueError as error:
         raise InvalidAnswerError(f"{without_secrets(text)}: {error}") from None
-    return url
+    found = answers.device.broker or answers.found_broker
+    return found if found and login == BrokerLogin(found.url) else login
+
+
+def _suggest_broker(answers: Answers) -> str:
+    found = answers.device.broker or answers.found_broker
+    return found.url if found else NO_BROKER
 
 
 def _suggest_series(answers: Answers) -> str:
@@ -195,9 +199,9 @@ QUESTIONS = (
     Question(
         "broker",
         "MQTT broker to publish to",
-        f"URL of the MQTT broker to which the service publishes, mqtt://host:port; {NO_BROKER}: no broker",
+        f"URL of the MQTT broker to which the service publishes, {FORM}; {NO_BROKER}: no broker",
         _parse_broker,
-        lambda answers: answers.device.broker or answers.found_broker or NO_BROKER,
+        _suggest_broker,
     ),
 )
 """Questions in their order."""

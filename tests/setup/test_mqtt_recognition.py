@@ -5,10 +5,11 @@ from collections.abc import Mapping
 
 import pytest
 
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.mqtt_recognition import PublisherRecognition
 
-BROKER = "mqtt://localhost:1883"
+BROKER = BrokerLogin("mqtt://localhost:1883")
 JK_NODE = {
     "home/jk/status": "online",
     "home/jk/sensor/jk_total_voltage/state": "52.81",
