@@ -108,6 +108,12 @@ COMMANDS = {
     "uninstall": LazyCommand(
         "bms_estimator.cli.settings.install:uninstall_command", "Remove the service from this machine."
     ),
+    "backup": LazyCommand(
+        "bms_estimator.cli.settings.backup:backup", "Write settings and learned state of a pack to an archive."
+    ),
+    "restore": LazyCommand(
+        "bms_estimator.cli.settings.backup:restore", "Restore settings and learned state of a pack from an archive."
+    ),
     "config": LazyCommand("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
 }
 

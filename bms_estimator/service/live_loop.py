@@ -206,7 +206,7 @@ async def _estimate(
         if edge:
             edge.take(received.samples, received.cells_v)
         publisher.alarm_monitor.check_silence()
-        step = pack.run(received.samples, received.cells_v)
+        step = pack.run(received.samples, received.cells_v, received.device_soc)
         totals.add(step.trace)
         publisher.add(received, step, slots.fault)
         await asyncio.sleep(0)  # a source that always has a block must not starve the sinks

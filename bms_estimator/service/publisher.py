@@ -32,7 +32,7 @@ from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
 from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.rest_detector import RestDetector
-from bms_estimator.telemetry.state import make_info_payload, make_state_payload
+from bms_estimator.telemetry.state import finite, make_info_payload, make_state_payload
 from bms_estimator.telemetry.weakest_cell import estimate_fields
 
 log = structlog.get_logger(__name__)
@@ -91,6 +91,7 @@ class Publisher:
         self._no_forecast = no_forecast(
             "the identifier is switched off" if is_battery else "a fuel cell has no state of charge"
         )
+        self._device_soc: float | None = None  # SOC that the device reported last
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
@@ -133,6 +134,7 @@ class Publisher:
         if trace.size:
             self._window.add(trace, self._clock.wall(), received.cells_v, received.probes)
             self._sample_s = now_s
+        self._device_soc = finite(received.device_soc[-1]) if received.device_soc.size else None
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
         elif self._drop_reason is not None:
@@ -249,6 +251,7 @@ class Publisher:
             self._flow,
             capacity_ah,
             estimate_fields(self._pack),
+            self._device_soc,
         )
 
     def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:

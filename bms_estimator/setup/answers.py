@@ -8,6 +8,7 @@ from bms_estimator.settings.page import DEFAULT_LISTEN
 from bms_estimator.settings.settings_template import GivenSettings
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import FoundDevice
+from bms_estimator.setup.measurement import Measurement
 
 
 class InvalidAnswerError(Exception):
@@ -32,8 +33,8 @@ class Answers:
     """Answers so far; None: not answered yet."""
 
     device: FoundDevice
-    voltage_v: float | None = None
-    """Measured voltage of the pack [V]; None: not measured."""
+    measured: Measurement | None = None
+    """Values of the device; None: no sample arrived."""
     name: str | None = None
     cell: str | None = None
     capacity_ah: float | None = None
@@ -44,12 +45,19 @@ class Answers:
     """Largest discharge current of the pack [A]; None: no limit is configured."""
     max_charge_a: float | None = None
     """Largest charge current of the pack [A]; None: no limit is configured."""
+    device_soc_std: float | None = None
+    """Std of the device's SOC, with which the pack starts; None: it is not used."""
     broker: BrokerLogin | None = None
     """Broker to which the service publishes; None: no broker."""
     found_broker: BrokerLogin | None = None
     """Broker that answered during the search; None: no broker answered."""
     sensor: tuple[tuple[str, object], ...] = ()
     """Settings of ``[sensor]`` from the comparison with a multimeter: key and value of each."""
+
+    @property
+    def voltage_v(self) -> float | None:
+        """Measured voltage of the pack [V]; None: not measured."""
+        return self.measured.voltage_v if self.measured else None
 
     @property
     def logins(self) -> Mapping[str, BrokerLogin]:
@@ -74,7 +82,8 @@ class Answers:
     def _tables(self, brokers: GivenSettings) -> GivenSettings:
         pack = {key: getattr(self, key) for key in ("name", "cell", "capacity_ah", "series", "parallel")}
         limits = {"max_discharge_a": self.max_discharge_a, "max_charge_a": self.max_charge_a}
-        pack |= {key: limit_a for key, limit_a in limits.items() if limit_a is not None}
+        optional = limits | {"device_soc_std": self.device_soc_std}
+        pack |= {key: value for key, value in optional.items() if value is not None}
         tables: dict[str, dict[str, object]] = {"pack": pack}
         for section, values in self.device.tables.items():
             tables[section] = dict(values)

@@ -134,7 +134,7 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
                 async with asyncio.timeout(LISTEN_S):
                     while True:
                         message = await connection.receive()
-                        recognition.add_message(message.topic, message.payload)
+                        recognition.add_message(message.topic, message.payload, retained=message.retain)
             except TimeoutError:
                 pass
     except LoginError:

@@ -5,10 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from bms_estimator.kernels.accumulators.soc_certainty import MIN_UNKNOWN_STD
-
-UNKNOWN_SOC = f"the SOC is not known yet: it is known once its standard deviation has fallen below {100.0 * MIN_UNKNOWN_STD:.0f} %"
-"""Reason without a known SOC."""
+UNKNOWN_SOC = "the SOC is not known yet: charge the pack to full once, or let it rest for ten minutes"
+"""Reason without a known SOC, and what helps."""
 ALWAYS_STABLE = "the thesis's model is valid at each SOC: delta_1 and delta_2 are not above 0"
 """Reason with capacitances that are positive at each SOC."""
 NOT_IDENTIFIED = "delta_1 and delta_2 follow from a7..a12, which are not valid: see the topic parameters"

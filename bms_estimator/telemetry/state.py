@@ -58,6 +58,7 @@ def make_state_payload(
     flow: ChargeEnergy,
     capacity_ah: float | None,
     cell_fields: Mapping[str, Any] = MappingProxyType({}),
+    device_soc: float | None = None,
 ) -> Estimate:
     """Return the payload of topic ``state``.
 
@@ -70,11 +71,13 @@ def make_state_payload(
         flow: Charge and energy at the terminals.
         capacity_ah: Rated capacity of the pack [Ah]; None for a fuel cell.
         cell_fields: Fields about single cells (``weakest_cell_fields``).
+        device_soc: SOC that the device reports, 0..1; None: not reported.
     """
     # a tuple of plain numbers, because reading the fields of a numpy record one by one is slow
     values = zip(TRACE.names or (), window.last.item(), strict=True)
     last = {name: value if math.isfinite(value) else None for name, value in values}
     innovation_v, soc, margin = last["innovation_v"], last["soc"], finite(known_margin(window.last, window.soc_known))
+    is_known = soc is not None and window.soc_known
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
@@ -88,7 +91,9 @@ def make_state_payload(
         **{name: last[name] for name in COPIED},
         voltage_estimate_v=None if innovation_v is None else window.voltage_v - innovation_v,
         soc_percent=None if soc is None else 100.0 * soc,
-        soc_known=soc is not None and window.soc_known,
+        soc_known=is_known,
+        device_soc=device_soc,
+        device_soc_difference=soc - device_soc if soc is not None and is_known and device_soc is not None else None,
         stability_margin=margin,
         stability_margin_std=None if margin is None else last["stability_margin_std"],
         stability_margin_reason=missing_margin_reason(window.last, soc_known=window.soc_known),

@@ -82,7 +82,8 @@ def new(
     parallel: Annotated[str | None, typer.Option(help=QUESTIONS[4].help, show_default=False)] = None,
     max_discharge_a: Annotated[str | None, typer.Option(help=QUESTIONS[5].help, show_default=False)] = None,
     max_charge_a: Annotated[str | None, typer.Option(help=QUESTIONS[6].help, show_default=False)] = None,
-    broker: Annotated[str | None, typer.Option(help=QUESTIONS[7].help, show_default=False)] = None,
+    device_soc_std: Annotated[str | None, typer.Option(help=QUESTIONS[7].help, show_default=False)] = None,
+    broker: Annotated[str | None, typer.Option(help=QUESTIONS[8].help, show_default=False)] = None,
     estimate: Annotated[
         bool, typer.Option("--estimate/--no-estimate", help="run the estimator for some seconds, and show the SOC")
     ] = True,
@@ -109,11 +110,11 @@ def new(
         measured = _measure(answers.device)
         options = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
         sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
-        voltage_v = measured.voltage_v if measured else None
-        answers = replace(answers, voltage_v=voltage_v, name=file.stem, sensor=sensor)
-        given = (name, cell, capacity_ah, series, parallel, max_discharge_a, max_charge_a, broker)
+        answers = replace(answers, measured=measured, name=file.stem, sensor=sensor)
+        given = (name, cell, capacity_ah, series, parallel, max_discharge_a, max_charge_a, device_soc_std, broker)
         for question, option in zip(QUESTIONS, given, strict=True):
-            answers = _ask(prompts, question, option, answers)
+            if option is not None or question.is_asked(answers):
+                answers = _ask(prompts, question, option, answers)
         pack = create_pack(file, answers)
         for warning in pack.warnings:
             typer.echo(f"warning: {warning}", err=True)

@@ -123,7 +123,8 @@ def _multimeter(session: SetupSession, form_key: str) -> str:
 
 
 def _pack(session: SetupSession, form_key: str) -> str:
-    fields = "".join(_question(session, question) for question in QUESTIONS)
+    asked = [each for each in QUESTIONS if session.answers and each.is_asked(session.answers)]
+    fields = "".join(_question(session, question) for question in asked)
     return f'<section class="card">{_form("pack", form_key, fields, "Write the settings file")}</section>'
 
 

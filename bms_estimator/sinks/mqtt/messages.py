@@ -21,11 +21,14 @@ from bms_estimator.sinks.home_assistant.discovery import (
 )
 from bms_estimator.sinks.home_assistant.entity_values import EntityStates, values_to_publish
 from bms_estimator.sinks.mqtt.topics import schema
+from bms_estimator.sinks.mqtt.venus_os import venus_battery
 
 AVAILABILITY = "availability"
 """Topic of the service's availability, below the device's topic."""
 SENSOR_AVAILABILITY = "sensor/availability"
 """Topic of the sensor's availability, below the device's topic."""
+VENUS = "venus"
+"""Topic of the battery for Venus OS, below the device's topic."""
 ANNOUNCED_ALARMS = ("collapse_risk",)
 """Alarms with an entity in Home Assistant before their first value, which follows only after minutes of load."""
 
@@ -75,6 +78,7 @@ class MessageBuilder:
             expire later with a longer period.
         home_assistant: Settings of Home Assistant.
         alarms: Monitored alarms; retained messages of others are removed.
+        venus_limits: Limits for Venus OS (``venus_battery``); None: nothing is published for it.
 
     Attributes:
         root: Root of all topics.
@@ -91,7 +95,9 @@ class MessageBuilder:
         sample_period_s: float = 0.0,
         home_assistant: HomeAssistantSettings | None = None,
         alarms: Collection[str] = ALARMS,
+        venus_limits: Mapping[str, float] | None = None,
     ) -> None:
+        self._venus_limits = venus_limits
         self._unwatched = tuple(name for name in ALARMS if name not in alarms)
         self._announced = {name for name in ANNOUNCED_ALARMS if name in alarms}
         self.root = f"{base_topic}/{device}"
@@ -148,6 +154,9 @@ class MessageBuilder:
             text = self._discovery(discovery_inputs)
             if sent.discovery_inputs is None or text != self._discovery(sent.discovery_inputs):
                 messages.append(Message(discovery_topic(self._home_settings, self._device), text, qos=1, retain=True))
+        if snapshot.estimate and self._venus_limits is not None:
+            battery = venus_battery(snapshot.estimate, snapshot.info, snapshot.alarms, self._venus_limits)
+            messages += [self._live(VENUS, _json(battery))] if battery else []
         values, entity_states = self._home_assistant(sent.entity_states, snapshot, discovery_inputs, now_s)
         return messages + values, PublishedState(snapshot, entity_states, discovery_inputs)
 

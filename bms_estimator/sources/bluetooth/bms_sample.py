@@ -13,7 +13,8 @@ def convert_sample(sample: Mapping[str, Any]) -> Reading | None:
     if math.isnan(voltage_v) or math.isnan(current_a):
         return None
     cells_v = tuple(_number(cell) for cell in sample.get("cell_voltages", ()))
-    return Reading(voltage_v, current_a, _temperatures_c(sample), cells_v)
+    soc, capacity_ah = _number(sample.get("battery_level")) / 100.0, _number(sample.get("design_capacity"))
+    return Reading(voltage_v, current_a, _temperatures_c(sample), cells_v, soc=soc, capacity_ah=capacity_ah)
 
 
 def _temperatures_c(sample: Mapping[str, Any]) -> tuple[float, ...]:

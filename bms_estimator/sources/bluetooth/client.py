@@ -119,7 +119,12 @@ class BleProducer(LineProducer):
             return None
         self._fault = None
         return sample_json_line(
-            reading.voltage_v, reading.current_a, temperatures_c=reading.temperatures_c, cells_v=reading.cells_v
+            reading.voltage_v,
+            reading.current_a,
+            temperatures_c=reading.temperatures_c,
+            cells_v=reading.cells_v,
+            soc=reading.soc,
+            capacity_ah=reading.capacity_ah,
         )
 
     async def _find(self) -> tuple[BLEDevice, type[BaseBMS]]:

@@ -39,6 +39,7 @@ ANSWERS = {
     "--parallel": "1",
     "--max-discharge-a": "60",
     "--max-charge-a": "none",
+    "--device-soc-std": "none",
     "--broker": "none",
 }
 """Answers about a pack of eight cells."""
@@ -100,7 +101,8 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
         ("Cells in parallel", "", "Largest discharge current"),
         ("Largest discharge current", "-5", "-5.0: must be greater than 0"),
         ("Largest discharge current", "60 A", "Largest charge current"),
-        ("Largest charge current", "", "MQTT broker"),
+        ("Largest charge current", "", "Standard deviation of the device's SOC"),
+        ("Standard deviation of the device's SOC", "", "MQTT broker"),
         ("MQTT broker", "localhost", "localhost: must be mqtt://host:port"),
         ("MQTT broker", "mqtt://localhost:99999", "mqtt://localhost:99999: Port out of range 0-65535"),
         ("MQTT broker", "none", "pack.toml: written; house: lfp, 8 in series"),
@@ -124,6 +126,7 @@ def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
     settings = load_settings(file)
     assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 40.0, 8)
     assert (settings.pack.max_discharge_a, settings.pack.max_charge_a) == (60.0, None)
+    assert settings.pack.device_soc_std == 0.1
     assert (settings.sensor.port, settings.sensor.protocol, settings.mqtt) == (path, "jk", None)
     assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
 
@@ -173,7 +176,7 @@ def test_the_service_is_installed_with_sudo(file, capsys, long_timeouts, tmp_pat
     ("arguments", "message"),
     [
         (["--no-compare", *options(cell=None)], "--cell: missing, and there is no terminal to ask"),
-        (["--yes", *options(capacity_ah=None)], "--capacity-ah: missing, and there is no default"),
+        (["--yes", *options(cell=None)], "--cell: missing, and there is no default"),
         (options(), "--compare: missing"),
         (["--no-compare", *options(series="4")], "--series 4: the device reports 8 cells in series"),
         (["--no-compare", *options(broker="ftp://x")], "--broker ftp://x: must be mqtt://host:port"),
