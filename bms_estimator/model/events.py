@@ -6,8 +6,7 @@ from typing import Literal, NamedTuple
 from pydantic import Field
 
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads.health import AnchorReport, Health
-from bms_estimator.model.payloads.pack_model import FitReport
+from bms_estimator.model.payloads.health import AnchorReport, FitReport, Health
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.model.payloads.snapshot import Snapshot
 

@@ -20,7 +20,7 @@ from bms_estimator.forecast.saved_load import restore_load
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import NO_CELLS, NO_SOC, CellBlock, SampleBlock
 from bms_estimator.pack.declared_capacity import with_capacity
 from bms_estimator.pack.state import (
@@ -90,7 +90,7 @@ class Pack:
         self._first_s = math.nan  # time of the first sample, if the device's SOC is awaited
         self.estimator, self.slow_fit, self.cells, self.forecaster = estimator, slow_fit, cells, forecaster
         self._has_forecasts = has_forecasts and forecaster is not None
-        self._has_cell_voltages = False
+        self._has_cells = False  # of the present block
         self._trace: TraceBlock = np.zeros(0, TRACE)
 
     @property
@@ -118,7 +118,7 @@ class Pack:
             cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
             device_soc: SOC by the device at the samples, 0..1, shape (n,); empty without any.
         """
-        self._has_cell_voltages |= cells_v.size > 0
+        self._has_cells = cells_v.size > 0 or (self.cells is not None and self.cells.cells.size > 0)
         if self._trace.size < samples.size:
             self._trace = np.zeros(samples.size, TRACE)
         forecaster, forecasts, start, rows = self.forecaster, list[tuple[ForecastRows, int]](), 0, 0
@@ -151,7 +151,7 @@ class Pack:
             stop = samples.size if prior is None else start + prior + 1
             used, written = self.estimator.run_part(samples[start:stop], self._trace[rows:])
             end, trace = start + used, self._trace[rows : rows + written]
-            if self._has_cell_voltages and self.cells:  # the call would take a tenth of the time of a single sample
+            if self._has_cells and self.cells:  # the call would take a tenth of the time of a single sample
                 self.cells.run(samples[start:end], cells_v[start:end], trace)
             if self.slow_fit:
                 self.slow_fit.advance()
@@ -281,8 +281,6 @@ def new_pack(
 ) -> Pack:
     """Return a new pack, after compiling or loading the kernels of its estimator.
 
-    A fuel cell, and a pack without the identifier, has neither slow fit nor forecasts.
-
     Args:
         settings: The pack's settings.
         model: Model of the whole pack.
@@ -293,13 +291,38 @@ def new_pack(
     Raises:
         UserError: The cut-off voltage is not below the voltage of the full pack.
     """
-    estimator = new_estimator(settings, model)
-    slow_fit = None
+
+    def slow_fit(estimator: Estimator, interval_s: float) -> SlowFit:
+        return SlowFit(estimator, submit=submit, interval_s=interval_s, on_failure=on_failure)
+
+    return assemble(new_estimator(settings, model), settings, slow_fit, has_forecasts=has_forecasts)
+
+
+def assemble(
+    estimator: Estimator,
+    settings: Settings,
+    new_fit: Callable[[Estimator, float], SlowFit],
+    *,
+    has_forecasts: bool = True,
+    has_load: bool = True,
+) -> Pack:
+    """Return the pack of an estimator. A fuel cell, and a pack without the identifier, has neither slow fit nor forecasts.
+
+    Args:
+        estimator: Estimator of the pack.
+        settings: The pack's settings.
+        new_fit: Returns the slow fit of an estimator with a maximum interval between two fits [s].
+        has_forecasts: False: no forecasts at intervals.
+        has_load: False: the load is not observed, so that there is no forecaster.
+
+    Raises:
+        UserError: The cut-off voltage is not below the voltage of the full pack.
+    """
+    slow_fit = forecaster = None
+    model = estimator.cell
     if estimator.identifying and settings.identifier.pack_model:
-        interval_s = settings.identifier.fit_interval_s or FIT_INTERVAL_S
-        slow_fit = SlowFit(estimator, submit=submit, interval_s=interval_s, on_failure=on_failure)
-    forecaster = None
-    if estimator.identifying and isinstance(model, CellModel):
+        slow_fit = new_fit(estimator, settings.identifier.fit_interval_s or FIT_INTERVAL_S)
+    if has_load and estimator.identifying and isinstance(model, CellModel):
         cutoff_v = load_cutoff_v(settings, model)
         forecaster = Forecaster(estimator, cutoff_v=cutoff_v, limits=power_limits(settings, model))
     device_soc_std = settings.pack.device_soc_std if estimator.identifying and isinstance(model, CellModel) else None

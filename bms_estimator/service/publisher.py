@@ -6,13 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 import structlog
 
 from bms_estimator.estimator.cell_estimator import CellDeviations
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.forecast import ForecastReport
 from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealth
-from bms_estimator.model.payloads.info import Info
-from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.payloads.snapshot import ForecastReport, Info, Snapshot
 from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.latency import Latency
@@ -24,16 +21,25 @@ from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import make_cells_payload
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
-from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
+from bms_estimator.telemetry.health import (
+    dropped_text,
+    make_health_payload,
+    out_of_range_reason,
+    pack_model_health,
+    sample_counters,
+)
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
-from bms_estimator.telemetry.pack_model import pack_model_health
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.rest_detector import RestDetector
-from bms_estimator.telemetry.state import finite, make_info_payload, make_state_payload
-from bms_estimator.telemetry.weakest_cell import estimate_fields
+from bms_estimator.telemetry.state import (
+    finite,
+    make_forecast_payload,
+    make_info_payload,
+    make_state_payload,
+    no_forecast,
+)
+from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 
 log = structlog.get_logger(__name__)
 
@@ -87,10 +93,7 @@ class Publisher:
         self._board: Mapping[str, str] = {}
         self._latency = Latency()
         self._forecast_s = -math.inf  # time of the last payload of the curves
-        is_battery = isinstance(cell, CellModel)
-        self._no_forecast = no_forecast(
-            "the identifier is switched off" if is_battery else "a fuel cell has no state of charge"
-        )
+        self._no_forecast = no_forecast(cell.no_forecast_reason)
         self._device_soc: float | None = None  # SOC that the device reported last
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
@@ -238,7 +241,7 @@ class Publisher:
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         # only saved values, so that the next run continues from there
         self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
-        capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
+        capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:
             forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)

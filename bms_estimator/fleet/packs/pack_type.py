@@ -1,24 +1,26 @@
-"""Type of packs. All packs of a type share one estimator.
+"""Type of packs. All packs of a type share one ``Pack``.
 
-The estimator is shared because its creation takes longer than estimating the samples of a day.
+It is shared because its creation takes longer than estimating the samples of a day.
 """
 
 import hashlib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.identity import pack_identity
+from bms_estimator.checkpoint.arrays_file import pack_identity
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
-from bms_estimator.pack_model.learning import FIT_INTERVAL_S, SlowFit
+from bms_estimator.model.pack_model import PackModel
+from bms_estimator.pack.pack import Pack, assemble
+from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.charge_limits import NO_LIMITS
 from bms_estimator.settings.pack import PackSettings, Settings
@@ -33,37 +35,64 @@ Digest = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class PackType:
-    """Settings, estimator and digests that packs of one type share.
+    """Settings, ``Pack`` and digests that packs of one type share.
 
     Attributes:
         settings: Settings of the packs; the name is not used.
         config_digest: Digest of the configuration of the estimator. A state of another digest is migrated.
         state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
-        estimator: Estimator bound to the unpacked record of the partition.
-        cells: Estimators of the single cells. They use the state of the pack whose block is processed.
+        pack: Pack whose estimator is bound to the unpacked record of the partition, without forecasts.
         short_limit_a: Minimum proven self-discharge of a cell with an internal short [A].
         meter: Charge and energy meter bound to the unpacked record.
         capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
         cutoff_v: Voltage at which the load of a pack is switched off [V]; NaN for a fuel cell.
         filter_bytes: Settings of the estimator's filter, which other types may share; a view.
         cell_file_bytes: These settings with the curves of the cell file.
-        slow_fit: Slow fit of the estimator, without a history; None: the packs have no fits.
-        fit_interval_s: Maximum interval between two fits [s].
     """
 
     settings: PackSettings
     config_digest: Digest
     state_digest: Digest
-    estimator: Estimator
-    cells: CellEstimator
+    pack: Pack
     short_limit_a: float
     meter: ChargeEnergyMeter
     capacity_ah: float | None
     cutoff_v: float
     filter_bytes: Bytes
     cell_file_bytes: Bytes
-    slow_fit: SlowFit | None
-    fit_interval_s: float
+
+    @property
+    def estimator(self) -> Estimator:
+        """Estimator bound to the unpacked record of the partition."""
+        return self.pack.estimator
+
+    @property
+    def cells(self) -> CellEstimator:
+        """Estimators of the single cells. They use the state of the loaded pack."""
+        assert self.pack.cells is not None  # noqa: S101 - for the type checker: each assembled pack has them
+        return self.pack.cells
+
+
+class WorkerFit(SlowFit):
+    """Slow fit of the packs of a type, whose histories and fits are outside of the worker.
+
+    Args:
+        estimator: Estimator bound to the unpacked record of the partition.
+        interval_s: Maximum interval between two fits [s].
+        advance: Handles rows and events of the loaded pack (``PackFits.advance``).
+    """
+
+    def __init__(self, estimator: Estimator, interval_s: float, advance: "Advance") -> None:
+        super().__init__(estimator, interval_s=interval_s)
+        self.interval_s, self._advance_loaded = interval_s, advance
+
+    def advance(self) -> None:
+        """Handle rows and events of the loaded pack."""
+        self._advance_loaded(self)
+
+
+Advance = Callable[[WorkerFit], None]
+"""Function that handles rows and events of the fits of the loaded pack."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +138,11 @@ class PackTypes:
 
     Args:
         record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
+        advance: Handles rows and events of the fits of the loaded pack.
     """
 
-    def __init__(self, record: NDArray[np.void]) -> None:
-        self._record = record
+    def __init__(self, record: NDArray[np.void], advance: Advance) -> None:
+        self._record, self._advance = record, advance
         self._types: dict[tuple[int, int], tuple[Settings, PackModel, PackType]] = {}
 
     def of(self, settings: Settings, cell: PackModel) -> PackType:
@@ -126,35 +156,36 @@ class PackTypes:
         if key not in self._types:
             if len(self._types) >= MAX_TYPES:
                 self._types.clear()
-            self._types[key] = settings, cell, pack_type(settings, cell, self._record)
+            self._types[key] = settings, cell, pack_type(settings, cell, self._record, self._advance)
         return self._types[key][2]
 
 
-def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void]) -> PackType:
-    """Create the type of packs with these settings.
+def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], advance: Advance) -> PackType:
+    """Create the type of packs with these settings. ``PackTypes`` describes the other arguments.
 
     Args:
         settings: Settings of the packs.
         cell: Model of a whole pack.
-        record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
+        record: Unpacked record of the partition.
+        advance: Handles rows and events of fits.
     """
     digest = config_digest(settings, cell)
     estimator = type_estimator(settings, cell).bound_to_record(record["estimator"])
-    has_fits, interval_s = estimator.identifying and settings.identifier.pack_model, settings.identifier.fit_interval_s
+
+    def new_fit(estimator: Estimator, interval_s: float) -> SlowFit:
+        return WorkerFit(estimator, interval_s, advance)
+
     return PackType(
         settings=settings.pack,
         config_digest=digest,
         state_digest=state_digest(settings, cell),
-        estimator=estimator,
-        cells=CellEstimator(estimator),
+        pack=assemble(estimator, settings, new_fit, has_load=False),
         short_limit_a=short_limit_a(settings, cell),
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
         cutoff_v=load_cutoff_v(settings, cell) if isinstance(cell, CellModel) else math.nan,
         filter_bytes=estimator.settings_record["filter"].view(np.uint8),
         cell_file_bytes=bytes_of(estimator.cell_file_settings),
-        slow_fit=SlowFit(estimator, interval_s=interval_s or FIT_INTERVAL_S) if has_fits else None,
-        fit_interval_s=interval_s or FIT_INTERVAL_S,
     )
 
 

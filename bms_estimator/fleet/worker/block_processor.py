@@ -2,20 +2,18 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.identity import without_observer
+from bms_estimator.checkpoint.arrays_file import without_observer
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.fleet.fits.messages import FitResult
 from bms_estimator.fleet.hour_row import HOUR_S
-from bms_estimator.fleet.packs.pack_type import Digest, PackType
+from bms_estimator.fleet.packs.pack_type import Digest, PackType, PackTypes
 from bms_estimator.fleet.worker import hour_summary
 from bms_estimator.fleet.worker.block_checks import MAX_TIMESTAMP_S, Arrival, clock_error_s
 from bms_estimator.fleet.worker.block_result import BlockResult
@@ -23,33 +21,36 @@ from bms_estimator.fleet.worker.pack_fits import PackFits
 from bms_estimator.fleet.worker.pack_state import (
     CONFIG_DIGEST,
     LAST_STORE_NS,
+    MAX_CELLS,
     PACK_STATE,
     STATE_DIGEST,
     Fields,
     UnpackedRecord,
 )
-from bms_estimator.fleet.worker.single_cells import SingleCells, known_voltages
 from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.forecast.forecast import Forecast, unknown_values
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.cells.records import BANK, CELL
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.payload import Payload
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
+from bms_estimator.telemetry.cells import make_cells_payload
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.state import make_state_payload
+from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 
 MAX_WALL_S = 2.0**34
 """Latest plausible wall clock [s since 1970]: the year 2514."""
-MAX_PART_SAMPLES = 4096
+MAX_PART_SAMPLES = 1024
 """Maximum number of samples that are estimated at a time. It limits the buffer of estimates of 200 bytes each, which
-exists for each partition."""
+exists for each type of packs of a partition."""
 NO_PEAK_A = 0.0
 """Peak current for ``write_usable_charge`` [A]. A worker does not store the peaks of the load. With 0, the mean current is
 used."""
+NO_CELL_STATES = np.zeros(0, CELL)
+"""States of the single cells of a pack without any."""
 NO_FORECAST_REASON = "a fleet worker makes no forecasts"
 
 
@@ -60,14 +61,16 @@ class BlockProcessor:
         unpacked: Record of dtype ``PACK_STATE``. The caller loads the state of a pack into it before each ``step``.
         counters: Counters of the partition; updated.
         wall: Wall clock for publish times [s since 1970].
+
+    Attributes:
+        types: Types of packs, whose estimators are bound to the record.
     """
 
     def __init__(self, unpacked: UnpackedRecord, counters: Counter[str], wall: Callable[[], float]) -> None:
         record = unpacked.record
         self._record, self._counters, self._wall = record, counters, wall
-        self._single_cells = SingleCells(unpacked)
-        self._fits = PackFits(record, counters)
-        self._trace: TraceBlock = np.zeros(0, TRACE)
+        self._unpacked, self._fits = unpacked, PackFits(record, counters)
+        self.types = PackTypes(record, self._fits.advance)
         self._delivery, self._charge_energy, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
         self._observer = record[0]["estimator"]["observer"]
         self._window = Window()
@@ -89,10 +92,10 @@ class BlockProcessor:
         if self._restore_or_reset(pack_type, unmigrated_fields, block):
             self._fits.use_curves(pack, pack_type)
         self._fits.begin_block(pack, pack_type, arrival.sequence)
-        self._single_cells.begin(pack_type.cells)
+        self._load_cells(pack_type)
         rows, is_new_hour = self._roll_over_hour(pack, block, arrival, pack_type)
         self._check_clock(block, arrival)
-        self._resume_after_store_change(pack_type.estimator, block)
+        self._resume_after_store_change(pack_type, block)
         # another pack may have used the window meanwhile
         self._window.previous_end_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
         self._window.soc_known = False
@@ -103,8 +106,7 @@ class BlockProcessor:
         parameters = cells = None
         if is_new_hour and state is not None:
             parameters = self._parameters_payload(pack_type.estimator, arrival_s, now_s)
-            report = self._single_cells.payload(pack_type.short_limit_a, now_s)
-            cells = None if report is None else _json(report)
+            cells = self._cells_payload(pack_type, now_s)
         return BlockResult(
             pack, state=state, parameters=parameters, cells=cells, hours=rows, history=self._fits.take_messages()
         )
@@ -133,7 +135,7 @@ class BlockProcessor:
             valid = saved if is_same_config else without_observer(saved)
             gap_s = self._gap_s(block)
             error = restore_state(pack_type.estimator, valid, gap_s)
-            self._single_cells.restore(pack_type.cells, gap_s, is_valid=not error)
+            self._resume_cells(pack_type, gap_s, is_valid=not error)
             # the restored estimator has no last sample, and its counters begin at 0
             self._charge_energy["sums"]["counted"] = 0
             self._hour["outliers_before"] = self._hour["searches_before"] = 0
@@ -142,13 +144,35 @@ class BlockProcessor:
             for name in ("flow", "hour", "fit", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
             d[LAST_STORE_NS] = d["hour"] = d["clock_error_s"] = 0
-            self._single_cells.reset()
+            self._unpacked.start_cells(0)
             self._counters["begun_anew"] += has_state
         self._fits.restart()
         d[CONFIG_DIGEST], d[STATE_DIGEST] = pack_type.config_digest, pack_type.state_digest
         return True
 
-    def _resume_after_store_change(self, estimator: Estimator, block: Block) -> None:
+    def _load_cells(self, pack_type: PackType) -> None:
+        """Let the estimators of the single cells use the state in the record, which may have none."""
+        cells, unpacked = pack_type.cells, self._unpacked
+        if unpacked.cell_count:
+            cells.use_state(unpacked.cells, unpacked.bank)
+        else:
+            cells.use_state(NO_CELL_STATES, np.zeros(1, BANK))
+
+    def _resume_cells(self, pack_type: PackType, gap_s: float, *, is_valid: bool) -> None:
+        """Adapt the state of the single cells in the record to other settings of the pack.
+
+        Args:
+            pack_type: Present type of the pack.
+            gap_s: Gap before the next sample [s]; infinite if unknown.
+            is_valid: True if the state of the pack was restored.
+        """
+        if is_valid and self._unpacked.cell_count == pack_type.cells.estimated_cells:
+            self._load_cells(pack_type)
+            pack_type.cells.resume(gap_s)
+        else:
+            self._unpacked.start_cells(0)
+
+    def _resume_after_store_change(self, pack_type: PackType, block: Block) -> None:
         """Resume the estimator after a gap if the edge's store is another one than for the last sample.
 
         Timestamps count from the creation of the store, and therefore the estimator cannot compute the gap.
@@ -160,42 +184,31 @@ class BlockProcessor:
         has_time_base = math.isfinite(self._observer["time_s"])
         if self._observer["started"] and has_time_base:
             gap_s = self._gap_s(block)
-            estimator.resume(gap_s)
-            self._single_cells.resume(gap_s)
+            pack_type.estimator.resume(gap_s)
+            pack_type.cells.resume(gap_s)
 
     def _estimate(self, block: Block, pack_type: PackType, arrival_s: float) -> None:
         """Estimate the samples; add the estimates to the hour, the charge and energy meter and the publish window."""
-        observer, counters = self._observer, self._counters
+        observer, counters, cells = self._observer, self._counters, pack_type.cells
         accepted_before, steps_back_before = int(observer["samples"]), int(observer["time_steps_back"])
         pack_type.meter.continue_from(
             ChargeEnergy(*(float(self._charge_energy[name]) for name in ChargeEnergy._fields))
         )
-        for part, trace in self._run(block, pack_type):
-            hour_summary.add(self._record["hour"], trace, part, pack_type.estimator)
+        is_complete = block.cells_v.shape[1] == cells.estimated_cells <= MAX_CELLS
+        cells_v = block.cells_v if is_complete else NO_CELLS
+        for start in range(0, block.samples.size, MAX_PART_SAMPLES):
+            part = slice(start, start + MAX_PART_SAMPLES)
+            samples, trace = block.samples[part], pack_type.pack.run(block.samples[part], cells_v[part]).trace
+            hour_summary.add(self._record["hour"], trace, samples.size, block.store_created_ns, pack_type.estimator)
             pack_type.meter.add(trace)
-            self._window.add(trace, arrival_s, known_voltages(part.cells_v))
-            self._single_cells.run(part, trace)
-            self._fits.advance(pack_type)
+            self._window.add(trace, arrival_s, known_voltages(block.cells_v[part]))
+        if cells.cells.size != self._unpacked.cell_count:  # the first block with cell voltages
+            self._unpacked.start_cells(cells.cells.size)
+            self._unpacked.cells[...], self._unpacked.bank[...] = cells.cells, cells.bank
         counters["blocks"] += 1
         counters["samples"] += block.samples.size
         counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted_before)
         counters["time_steps_back"] += int(observer["time_steps_back"]) - steps_back_before
-
-    def _run(self, block: Block, pack_type: PackType) -> Iterator[tuple[Block, TraceBlock]]:
-        """Yield parts of a block, each with its estimates. A part ends where ``PackFits`` must take rows or adopt a fit."""
-        if self._trace.size < min(block.samples.size, MAX_PART_SAMPLES):
-            self._trace = np.zeros(min(block.samples.size, MAX_PART_SAMPLES), TRACE)
-        start = 0
-        while start < block.samples.size:
-            samples = block.samples[start : start + MAX_PART_SAMPLES]
-            used, written = pack_type.estimator.run_part(samples, self._trace)
-            part = slice(start, start + used)
-            is_whole = used == block.samples.size
-            yield (
-                block if is_whole else replace(block, samples=block.samples[part], cells_v=block.cells_v[part]),
-                self._trace[:written],
-            )
-            start += used
 
     def _state_payload(self, pack_type: PackType, now_s: float) -> bytes | None:
         """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
@@ -207,7 +220,7 @@ class BlockProcessor:
         # ``blocks`` does not count the present block yet
         counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
         values = unknown_values()
-        write_usable_charge(values, pack_type.estimator, pack_type.cutoff_v, NO_PEAK_A)
+        write_usable_charge(values, pack_type.estimator, pack_type.cutoff_v, NO_PEAK_A, pack_type.cells.deviations)
         forecast = Forecast(float(window.last["time_s"]), values, NO_FORECAST_REASON, None)
         remaining_ah = remaining_capacity_ah(pack_type.estimator)
         return _json(
@@ -219,13 +232,18 @@ class BlockProcessor:
                 now_s,
                 totals,
                 pack_type.capacity_ah,
-                self._single_cells.state_fields(),
+                estimate_fields(pack_type.pack),
             )
         )
 
     def _parameters_payload(self, estimator: Estimator, arrival_s: float, now_s: float) -> bytes:
         """Return the payload of topic ``parameters``. Its ages refer to the arrival time of the samples."""
         return _json(make_parameters_payload(estimator, arrival_s).model_copy(update={"publish_time": iso_utc(now_s)}))
+
+    def _cells_payload(self, pack_type: PackType, now_s: float) -> bytes | None:
+        """Return the payload of topic ``cells``; None without an estimate."""
+        cells = pack_type.cells.deviations
+        return None if cells is None else _json(make_cells_payload(cells, pack_type.short_limit_a, now_s))
 
     def _check_times(self, samples: SampleBlock) -> None:
         """Set implausible timestamps to NaN."""
@@ -264,7 +282,7 @@ class BlockProcessor:
         if current:
             settings = pack_type.settings.model_copy(update={"name": pack})
             row = hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)
-            row = row.model_copy(update=self._single_cells.row_fields() | self._origin(arrival))
+            row = row.model_copy(update=hour_summary.cell_fields(pack_type.cells.deviations) | self._origin(arrival))
             # the collector sets missing values to null, so that a pack without cell voltages has a shorter row
             rows = ((f"{pack}.{current}.{arrival.sequence}", row.model_dump_json(exclude_defaults=True).encode()),)
         hour_summary.begin(self._record["hour"], self._record[0]["estimator"])
@@ -302,6 +320,11 @@ def _finite_times_s(samples: SampleBlock) -> NDArray[np.float64]:
     times: NDArray[np.float64] = samples["time_s"]
     finite: NDArray[np.float64] = times[np.isfinite(times)]
     return finite
+
+
+def known_voltages(cells_v: CellBlock) -> CellBlock:
+    """Return the rows with a voltage, because an edge does not send the cell voltages of all samples of a large block."""
+    return cells_v[np.isfinite(cells_v).any(axis=1)] if cells_v.size else cells_v
 
 
 def _digest(words: NDArray[np.uint64]) -> Digest:

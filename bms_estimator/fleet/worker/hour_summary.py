@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.edge.block import Block
+from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.estimator.identified_parameters import current_offset, relative_capacity, relative_series_resistance
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
@@ -50,24 +51,41 @@ def begin(sums: Sums, record: np.void) -> None:
     sums["outliers_before"], sums["searches_before"] = record["counters"]["gated"], record["filter"]["reopened"]
 
 
-def add(sums: Sums, trace: TraceBlock, block: Block, estimator: Estimator) -> None:
-    """Add a block to the sums of the hour.
+def add(sums: Sums, trace: TraceBlock, samples: int, store_ns: int, estimator: Estimator) -> None:
+    """Add samples to the sums of the hour.
 
     Args:
         sums: Updated in place.
-        trace: Estimates of the block's samples.
-        block: Block of samples.
+        trace: Estimates of the samples.
+        samples: Number of samples, of which the estimator may have rejected some.
+        store_ns: Creation time of the edge's store [ns since 1970].
         estimator: Estimator of the pack, or of another pack of its type: only its settings are read.
     """
     gap_s = float(estimator.settings[0]["gap_s"])
-    accumulate_hour(sums, trace, int(sums["store"][0]) != block.store_created_ns, gap_s, rest_current_a(estimator))
-    sums["store"] = block.store_created_ns
-    sums["dropped"] += block.samples.size - trace.size
+    accumulate_hour(sums, trace, int(sums["store"][0]) != store_ns, gap_s, rest_current_a(estimator))
+    sums["store"] = store_ns
+    sums["dropped"] += samples - trace.size
 
 
 def rest_current_a(estimator: Estimator) -> float:
     """Return the maximum current of a resting pack [A]."""
     return REST_C * float(estimator.settings[0]["capacity_as"]) / HOUR_S
+
+
+def cell_fields(cells: CellDeviations | None) -> dict[str, float]:
+    """Return the fields of a row about single cells; empty without an estimate."""
+    if cells is None:
+        return {}
+    leaking = int(np.argmax(cells.self_discharge_a / cells.self_discharge_std_a))
+    return {
+        "weakest_cell": cells.weakest + 1,
+        "weakest_cell_soc_deviation": float(cells.soc_deviation[cells.weakest]),
+        "weakest_cell_resistance_ratio": float(cells.resistance_ratio[cells.weakest]),
+        "cell_soc_spread": float(np.ptp(cells.soc_deviation)),
+        "self_discharge_cell": leaking + 1,
+        "self_discharge_a": float(cells.self_discharge_a[leaking]),
+        "self_discharge_std_a": float(cells.self_discharge_std_a[leaking]),
+    }
 
 
 def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour:

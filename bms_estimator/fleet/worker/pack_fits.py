@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import FitRequest, FitResult, Rows, RowsPosition, encode_rows
-from bms_estimator.fleet.packs.pack_type import Bytes, PackType, bytes_of
+from bms_estimator.fleet.packs.pack_type import Bytes, PackType, WorkerFit, bytes_of
 from bms_estimator.fleet.worker.block_result import HistoryMessage
 from bms_estimator.fleet.worker.pack_state import PACK_FIT
 from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, FREE_ROWS
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import adopt_curves
-from bms_estimator.pack_model.learning import ADOPT_DELAY_S, SlowFit, fit_interval
+from bms_estimator.pack_model.learning import ADOPT_DELAY_S, fit_interval
 from bms_estimator.pack_model.saved import curve_arrays, fit_of_curves
 
 MAX_CACHED_CURVES = 4096
@@ -44,7 +44,7 @@ class PackFits:
         self._filter = record[0]["estimator"]["filter"]
         self._counters = counters
         self._curves = lru_cache(MAX_CACHED_CURVES)(self._compute_curves)
-        self._pack, self._sequence = "", 0
+        self._pack, self._digest, self._sequence = "", (0, 0), 0
         self._messages: list[HistoryMessage] = []
 
     def use_curves(self, pack: str, pack_type: PackType) -> None:
@@ -68,24 +68,21 @@ class PackFits:
             pack_type: Type of the pack.
             sequence: Stream sequence number of the block.
         """
-        self._pack, self._sequence, self._messages = pack, sequence, []
-        if pack_type.slow_fit and not self._h["enabled"]:
-            self._h["enabled"] = 1
-            self._h["event_s"] = self._h["elapsed_s"] + pack_type.slow_fit.interval()
+        self._pack, self._digest, self._sequence, self._messages = pack, pack_type.state_digest, sequence, []
+        if pack_type.pack.slow_fit and not self._h["enabled"]:
+            pack_type.estimator.schedule(self._h["elapsed_s"] + pack_type.pack.slow_fit.interval())
 
     def restart(self) -> None:
         """Drop a request, because the pack's settings have changed. The next block begins a new interval."""
         self._fit["request"], self._fit["received"], self._h["enabled"] = 0, np.zeros((), PACK_FIT), 0
 
-    def advance(self, pack_type: PackType) -> None:
-        """Take completed rows, and request or adopt a fit that is due. Call it each time ``Estimator.run_part`` returns."""
-        h, slow_fit = self._h, pack_type.slow_fit
-        if slow_fit is None:
-            return
+    def advance(self, slow_fit: WorkerFit) -> None:
+        """Take completed rows, and request or adopt a fit that is due."""
+        h = self._h
         if h["elapsed_s"] >= h["event_s"]:
-            self._handle_event(pack_type, slow_fit)
+            self._handle_event(slow_fit)
         elif h["count"] >= FULL_ROWS:
-            self._send_rows(pack_type)
+            self._send_rows(slow_fit)
 
     def take_messages(self) -> tuple[HistoryMessage, ...]:
         """Return the messages of the block."""
@@ -99,35 +96,36 @@ class PackFits:
             sequence: Stream sequence number of its message.
             pack_type: Type of the pack.
         """
-        fit, h = self._fit, self._h
-        if pack_type.slow_fit is None or fit["request"] != result.request:
+        fit, h, slow_fit = self._fit, self._h, pack_type.pack.slow_fit
+        if not isinstance(slow_fit, WorkerFit) or fit["request"] != result.request:
             return False
         if not result.is_fitted:
             fit["request"] = 0
-            h["event_s"] = fit["begun_s"] + fit_interval(float(fit["begun_s"]), pack_type.fit_interval_s)
+            begun_s = float(fit["begun_s"])
+            slow_fit.estimator.schedule(begun_s + fit_interval(begun_s, slow_fit.interval_s))
             return True
         write_fit(fit["received"], result, sequence)
         if h["event_s"] > fit["begun_s"] + ADOPT_DELAY_S:
-            h["event_s"] = h["elapsed_s"]  # it is late: adopt it at the next sample
+            slow_fit.estimator.schedule(h["elapsed_s"])  # it is late: adopt it at the next sample
         return True
 
-    def _handle_event(self, pack_type: PackType, slow_fit: SlowFit) -> None:
+    def _handle_event(self, slow_fit: WorkerFit) -> None:
         """Adopt the received fit, or request a fit if there is no request, or one that was not answered for an interval."""
         fit, h = self._fit, self._h
         due_s = fit["begun_s"] + ADOPT_DELAY_S
         if fit["received"]["sequence"]:
             self._adopt(slow_fit)
             fit["request"], fit["received"] = 0, np.zeros((), PACK_FIT)
-            h["event_s"] = due_s + (slow_fit.interval() - ADOPT_DELAY_S)
+            slow_fit.estimator.schedule(due_s + (slow_fit.interval() - ADOPT_DELAY_S))
         elif fit["request"] and h["event_s"] == due_s:
             self._counters["late_fits"] += 1
-            h["event_s"] = due_s + slow_fit.interval()
+            slow_fit.estimator.schedule(due_s + slow_fit.interval())
         else:
-            self._send_rows(pack_type, is_request=True)
+            self._send_rows(slow_fit, is_request=True)
             fit["request"], fit["begun_s"] = self._sequence, h["elapsed_s"]
-            h["event_s"] = h["elapsed_s"] + ADOPT_DELAY_S
+            slow_fit.estimator.schedule(h["elapsed_s"] + ADOPT_DELAY_S)
 
-    def _adopt(self, slow_fit: SlowFit) -> None:
+    def _adopt(self, slow_fit: WorkerFit) -> None:
         """Adopt the received fit, unless the filter knows the SOC better. After an exception, the previous fit stays in force."""
         received, estimator = self._fit["received"], slow_fit.estimator
         if not received["min_filter_std"] <= self._filter["soc_std"]:
@@ -142,11 +140,11 @@ class PackFits:
             self._fit["in_force"] = received
             self._counters["fits"] += 1
 
-    def _send_rows(self, pack_type: PackType, *, is_request: bool = False) -> None:
+    def _send_rows(self, slow_fit: WorkerFit, *, is_request: bool = False) -> None:
         """Send the completed rows, and a request for a fit of all rows so far."""
-        rows = pack_type.estimator.take_rows()
+        rows = slow_fit.estimator.take_rows()
         position, identity = RowsPosition(self._sequence, len(self._messages)), f"{self._pack}.{self._sequence}"
-        data = encode_rows(Rows(rows, position, pack_type.state_digest))
+        data = encode_rows(Rows(rows, position, self._digest))
         self._messages.append(HistoryMessage(subjects.history(self._pack), data, f"{identity}.{position.part}"))
         if is_request:
             request = FitRequest(sequence=self._sequence, part=position.part).model_dump_json().encode()

@@ -69,13 +69,13 @@ class Partition:
         self.number, self.sequence = number, 0
         self._counters: Counter[str] = Counter()
         self._records = PackRecords(self._counters)
-        self.in_force = TableInForce(table, sources, self._records.unpacked.record)
+        self._processor = BlockProcessor(self._records.unpacked, self._counters, wall)
+        self.in_force = TableInForce(table, sources, self._processor.types)
         self.deferred = Deferred()
         self.clock_errors: dict[str, float] = {}
         self._unsaved = UnsavedPositions()
         self._replied: set[str] = set()  # packs whose edge has had a reply from this worker
         self._logged_rejections: set[str] = set()
-        self._processor = BlockProcessor(self._records.unpacked, self._counters, wall)
 
     @classmethod
     def restore(

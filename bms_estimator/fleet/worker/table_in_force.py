@@ -7,12 +7,9 @@ settings, whichever worker processes it.
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
 from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.pack import Settings
 
 PackLookup = Callable[[str], tuple[Settings, PackModel] | None]
@@ -36,14 +33,14 @@ class TableInForce:
         table: Settings and models of the packs.
         sources: Rows of the same table, whose changes are applied in the order of the stream; None: a change takes effect
             at once.
-        record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
+        types: Types of the packs of the partition.
     """
 
-    def __init__(self, table: PackLookup, sources: PackSources | None, record: NDArray[np.void]) -> None:
+    def __init__(self, table: PackLookup, sources: PackSources | None, types: PackTypes) -> None:
         self._table, self._sources = table, sources
         self._rows: dict[str, PackSource] = {}  # of each pack with processed blocks
         self._type_by_pack: dict[str, PackType] = {}
-        self._types = PackTypes(record)
+        self._types = types
 
     @property
     def rows(self) -> Mapping[str, PackSource]:

@@ -23,7 +23,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
 from bms_estimator.fleet.queries.duckdb_queries import LIMITS, Limits, run_query
 from bms_estimator.fleet.queries.parquet_files import write
@@ -115,9 +114,7 @@ def slots(
         if first == end:
             continue
         begin(sums, estimator.record[0])
-        # ``add`` uses only store and samples of a block
-        block = Block(store_created_ns=STORE_ID, number=1, oldest=1, arrival_s=0.0, samples=samples[first:end])
-        add(sums, estimator.run(block.samples), block, estimator)
+        add(sums, estimator.run(samples[first:end]), end - first, STORE_ID, estimator)
         hour = row(PackSettings(name=pack, cell=cell.cell.name[:30]), slot, sums, estimator)
         if hour.soc is not None and hour.soc_mean_std:
             estimates.append(SlotEstimate(hour, hour.soc - float(truth[end - 1])))

@@ -16,8 +16,8 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.state import make_state_payload
+from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 from tests.benchmarks.load import CELL, pulses
 from tests.benchmarks.table import Row
 
@@ -117,7 +117,10 @@ def _part_us(partition: Partition, samples: SampleBlock, blocks: list[bytes]) ->
     yield "decoding its bytes", _call_us(lambda: decode(blocks[-1]))
     yield "unpacking the state of the pack", _call_us(lambda: unpacked.load(packed))
     yield "the estimator", _call_us(step) - restore_us
-    yield "the hour's sums", _call_us(lambda: hour_summary.add(unpacked.record["hour"], trace, block, estimator))
+    yield (
+        "the hour's sums",
+        _call_us(lambda: hour_summary.add(unpacked.record["hour"], trace, SAMPLES, STORE_ID, estimator)),
+    )
     yield "charge and energy", _call_us(lambda: (pack_type.meter.add(trace), pack_type.meter.update_totals()))
     yield (
         "usable charge and energy",

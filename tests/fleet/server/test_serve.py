@@ -28,7 +28,7 @@ from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.nats_server_program import find_server
+from bms_estimator.process.child_process import find_server
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from tests.command_line import run
 from tests.fleet.serve_process import ServeProcess

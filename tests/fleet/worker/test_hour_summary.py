@@ -9,7 +9,7 @@ import pytest
 from bms_estimator import Estimator, load_cell
 from bms_estimator.edge.block import Block
 from bms_estimator.fleet.worker.hour_summary import HOUR_SUMS, Hour, add, begin, hour_of, row
-from bms_estimator.model.fuel_cell import load_any
+from bms_estimator.model.pack_model import load_any
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings
@@ -25,17 +25,10 @@ HOUR_SAMPLES = 3600
 PACK = PackSettings(name="p1", cell="ncr18650", series=1, parallel=2)
 
 
-def block(samples, number=1, store=STORE_ID_NS):
-    """Return a block that arrives at the time of its last sample."""
-    last_s = float(samples["time_s"][-1])
-    return Block(store_created_ns=store, number=number, oldest=1, arrival_s=store / 1e9 + last_s, samples=samples)
-
-
 def add_blocks(sums, estimator, samples, store=STORE_ID_NS):
     """Run the estimator over ``samples`` in blocks of 60, and add the results to ``sums``."""
     for first in range(0, samples.size, 60):
-        minute_block = block(samples[first : first + 60], first // 60 + 1, store)
-        add(sums, estimator.run(minute_block.samples), minute_block, estimator)
+        add(sums, estimator.run(samples[first : first + 60]), 60, store, estimator)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +100,7 @@ def test_row_is_restored_from_json(hour):
 def test_row_does_not_depend_on_the_size_of_the_blocks(hour):
     sums, estimator, samples = hour
     one_block_sums, other_estimator = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    add(one_block_sums, other_estimator.run(samples), block(samples), other_estimator)
+    add(one_block_sums, other_estimator.run(samples), samples.size, STORE_ID_NS, other_estimator)
     assert row(PACK, 1, one_block_sums, other_estimator) == row(PACK, 1, sums, estimator)
 
 
@@ -144,7 +137,7 @@ def test_dropped_samples_are_counted_and_unknown_values_are_none():
     samples = np.zeros(3, SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["temperature_c"] = range(3), math.nan, math.nan
     sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_cell("ncr18650"))
-    add(sums, estimator.run(samples), block(samples), estimator)
+    add(sums, estimator.run(samples), samples.size, STORE_ID_NS, estimator)
     summary = row(PACK, 1, sums, estimator)
     assert (summary.samples, summary.dropped) == (0, 3)
     unknown_values = (summary.soc, summary.voltage_v, summary.temperature_c, summary.r_s_ratio)
@@ -155,7 +148,7 @@ def test_row_of_a_fuel_cell_has_no_soc_and_capacity():
     samples = np.zeros(60, SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["current_a"] = range(60), 30.0, 1.0
     sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_any("pem_30w"))
-    add(sums, estimator.run(samples), block(samples), estimator)
+    add(sums, estimator.run(samples), samples.size, STORE_ID_NS, estimator)
     summary = json.loads(row(PACK, 1, sums, estimator).model_dump_json())
     assert (summary["soc"], summary["capacity_ah"], summary["soc_std"]) == (None, None, None)
 
@@ -163,8 +156,8 @@ def test_row_of_a_fuel_cell_has_no_soc_and_capacity():
 def test_block_belongs_to_the_hour_of_its_last_sample():
     samples = np.zeros(60, SAMPLE)
     samples["time_s"] = 3600.0 - 30.0 + np.arange(60)
-    assert hour_of(block(samples)) == STORE_HOUR + 1
-    assert hour_of(block(samples[:30])) == STORE_HOUR
+    for count, hour in ((60, STORE_HOUR + 1), (30, STORE_HOUR)):
+        assert hour_of(Block(STORE_ID_NS, 1, 1, arrival_s=0.0, samples=samples[:count])) == hour
 
 
 def test_block_with_an_infinite_last_time_belongs_to_the_hour_of_its_store():

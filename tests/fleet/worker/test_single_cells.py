@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bms_estimator.telemetry.forecast import NAMES
+from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 
 from bms_estimator.edge.block import Block, decode, encode
 from bms_estimator.estimator.cell_estimator import CellEstimator
@@ -17,8 +19,14 @@ from bms_estimator.fleet.worker.checkpoint.record_layout import cell_count, cell
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import NO_CELLS
+from bms_estimator.pack.pack import assemble
+from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
+from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
+from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.state import make_state_payload
+from bms_estimator.telemetry.weakest_cell import estimate_fields
 from tests.fleet.partition_stream import STORE_ID_NS, estimates_of
 
 CELLS, CAPACITY_AH, WEAK = 4, 20.0, 2
@@ -110,6 +118,37 @@ def test_worker_publishes_the_weakest_cell_with_each_block_and_all_cells_once_an
     _, cells = replayed(blocks["b"][:61])
     report = json.loads(results[60].cells)
     assert [cell["soc"] for cell in report["cells"]] == cells.deviations.soc.tolist()
+
+
+def test_state_agrees_in_every_field_with_that_of_a_replay(blocks):
+    _, results = run(Partition(0, table, wall=lambda: 0.0), {"b": blocks["b"]})
+    pack = assemble(
+        make_estimator(SETTINGS, MODEL), SETTINGS, lambda estimator, _: SlowFit(estimator, interval_s=math.inf)
+    )
+    meter, window = ChargeEnergyMeter(ChargeEnergy(), float(pack.estimator.settings["gap_s"][0])), Window()
+    for block in (decode(encode(block)) for block in blocks["b"]):
+        trace = pack.run(block.samples, block.cells_v).trace
+        meter.add(trace)
+        totals = meter.update_totals()
+        window.add(trace, block.arrival_s, block.cells_v)
+        summary = window.take()
+    replayed = make_state_payload(
+        summary,
+        remaining_capacity_ah(pack.estimator),
+        pack.forecaster.forecast(),
+        {"frames_received": MINUTES},
+        0.0,
+        totals,
+        CAPACITY_AH,
+        estimate_fields(pack),
+    )
+    state, expected = json.loads(results[-1].state), json.loads(replayed.model_dump_json())
+    assert state.keys() == expected.keys()
+    peaks = "usable_capacity_ah", "remaining_energy_wh"  # a worker does not know the peaks of the load
+    assert [state[name] for name in peaks] == pytest.approx([expected[name] for name in peaks], rel=0.02)
+    forecast_only = {*NAMES, "forecast_reason"}
+    assert {name for name in state if state[name] != expected[name]} <= forecast_only
+    assert state["usable_capacity_ah"] < 0.9 * state["soc"] * CAPACITY_AH  # the weak cell is empty first
 
 
 def test_state_has_the_last_known_cell_voltages_of_a_block():
