@@ -60,6 +60,7 @@ def _call_kernels() -> None:
     known_rows(trace, False)
     pack = cell.pack(MIN_CELLS, 1)
     CellEstimator(new_estimator(Settings(), pack)).run(sample, np.zeros((1, MIN_CELLS)), trace)
+    estimator.add_prior(0.5, 0.1)
     estimator.set_soc(0.5)
     estimator.resume(0.0)
     make_parameters_payload(estimator, 0.0)

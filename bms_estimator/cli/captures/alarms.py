@@ -120,7 +120,7 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
         async for each in source:
             received = each._replace(cells_v=slots.select(each.cells_v))
             now_s = max(now_s, float(received.samples["time_s"][-1]))
-            monitor.add(received, pack.run(received.samples, received.cells_v), now_s, slots.fault)
+            monitor.add(received, pack.run(received.samples, received.cells_v, received.device_soc), now_s, slots.fault)
             bar.update(source.fraction)
     if slots.reason:
         typer.echo(f"warning: no estimates of single cells: {slots.reason}", err=True)
