@@ -12,15 +12,13 @@ from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealt
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info, Snapshot
 from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.latency import Latency
-from bms_estimator.service.service_status import ServiceStatus
+from bms_estimator.service.service_status import Latency, ServiceStatus
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import make_cells_payload
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.health import (
     dropped_text,
     make_health_payload,
@@ -28,10 +26,9 @@ from bms_estimator.telemetry.health import (
     pack_model_health,
     sample_counters,
 )
-from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals, new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.publish_window import Window, WindowSummary
-from bms_estimator.telemetry.rest_detector import RestDetector
+from bms_estimator.telemetry.publish_window import RestDetector, Window, WindowSummary
 from bms_estimator.telemetry.state import make_forecast_payload, make_info_payload, make_state_payload, no_forecast
 from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 
