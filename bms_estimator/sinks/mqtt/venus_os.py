@@ -6,9 +6,8 @@ The keys are those of its README (github.com/mr-manuel/venus-os_dbus-mqtt-batter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.info import Info
+from bms_estimator.model.payloads.snapshot import Alarm, Info
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import PackSettings
 
