@@ -145,8 +145,8 @@ async def shoot_first_day(folder: Path, browser: Browser) -> None:
 
 
 async def shoot_weeks(folder: Path, browser: Browser) -> None:
-    """Write screenshots of a pack after a week, discharging."""
-    async with House(7.0, 0.6, 20.0).page(folder) as url:
+    """Write screenshots of a pack after four days, discharging."""
+    async with House(4.0, 0.6, 20.0).page(folder) as url:
         async with open_page(browser, url) as page_tab:
             await shoot(page_tab, "desktop")
             await shoot(page_tab, "cells", ".cells")
