@@ -16,7 +16,7 @@ from bms_estimator.estimator.restore import restore_state
 from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.forecast.saved_load import restore_load
+from bms_estimator.forecast.load_history import restore_load
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel

@@ -9,12 +9,11 @@ from bms_estimator.model.config_file import Fraction, Positive, Strict, read_tom
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.registry import max_batteries
 from bms_estimator.settings.alarms import AlarmSettings
-from bms_estimator.settings.charge_limits import ChargeLimits
 from bms_estimator.settings.exports import EdgeSettings, InfluxSettings, PrometheusSettings
 from bms_estimator.settings.mqtt import HomeAssistantSettings, MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.sampling import ChargeLimits, Sampling
 from bms_estimator.settings.sensor import ALLOWED_WITH_SOURCE, SensorSettings
 from bms_estimator.settings.sources.ble import BleSource
 from bms_estimator.settings.sources.can import CanSource

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.table import show_status
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
@@ -120,8 +120,8 @@ def new(
             typer.echo(f"warning: {warning}", err=True)
         typer.echo(f"{file}: written; {pack.summary}")
         if estimate and measured:
-            with show_compile_progress():
-                load_kernels()
+            compile_ahead()
+            load_kernels()
             asyncio.run(run_estimator(pack.settings, pack.cell, _print_estimate, seconds=ESTIMATE_S))
             if note := load_note(measured.current_a, pack.cell.cell.capacity_ah):
                 typer.echo(note)
