@@ -41,7 +41,7 @@ CELLS, CAPACITY_AH = 16, 280.0
 """Number of cells, and their capacity [Ah]."""
 STEP_S, LIVE_S = 10.0, 600.0
 """Interval of the samples, and duration at the end with a sample each second, which the live curves show [s]."""
-FULL_V = 3.5
+FULL_V = 3.42
 """Voltage of a cell above which the charger reduces its current [V]."""
 TOP_PX = 500
 """Height of the upper part of the page, with alarms or the note about stale values [px]."""
