@@ -19,7 +19,7 @@ from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.process.state_folder import state_folder
