@@ -22,6 +22,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements
 from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.history import History
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.pack import Settings
 
@@ -114,7 +115,7 @@ def _use_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, i
     """
     files = StateFiles(state_folder(settings), settings, model)
     saved = files.saved_pack().pack
-    rows = saved.slow_fit.history.rows if saved.slow_fit else np.zeros(0)
+    rows = (saved.slow_fit.history if saved.slow_fit else History()).rows
     if saved.slow_fit is None or rows.size == 0:
         raise UserError(f"{files.history.path}: no history of the use yet; give --between LOW HIGH")
     fit = saved.slow_fit.saved_fit
