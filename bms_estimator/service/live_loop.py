@@ -80,6 +80,8 @@ class FitThread:
 
 LAG_STEP_S = 0.1
 """Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""
+SEND_TURNS = 2
+"""Number of turns of the event loop in which a published estimate is sent: one takes it from the outbox, one writes it."""
 STATUS_S = 60.0
 """Interval between two SOC texts for systemd [s]. The start and end of samples are reported at once."""
 
@@ -250,10 +252,14 @@ async def _estimate(
         if edge:
             edge.take(received.samples, received.cells_v)
         publisher.alarm_monitor.check_silence()
-        step = pack.run(received.samples, received.cells_v)
+        step = pack.run(received.samples, received.cells_v, received.device_soc)
         totals.add(step.trace)
-        publisher.add(received, step, slots.fault)
-        await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
+        try:
+            # the sinks send now, so that the alarms do not delay them and a source that always has a block does not starve them
+            for _ in range(SEND_TURNS if publisher.add_estimates(received, step) else 1):
+                await asyncio.sleep(0)
+        finally:  # the final save needs the alarms of all samples
+            publisher.add_to_alarms(received, step, slots.fault)
 
 
 async def _keep_alive(

@@ -12,7 +12,7 @@ import typer
 
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.options.capture_options import CELL_HELP, AsJson, CapacityAh, complete_battery
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.pack_options import pack_or_cell
 from bms_estimator.cli.options.table import print_table
 from bms_estimator.estimator.estimator import make_estimator
@@ -81,8 +81,8 @@ def accuracy(
     if pack is None:
         window = Window(0.0, has_temperature=False)
     else:
-        with show_compile_progress():
-            window, present_std, full_charges = _use_of_pack(settings, model)
+        compile_ahead()
+        window, present_std, full_charges = _use_of_pack(settings, model)
     if between is not None:
         window = _with_ends(window, *between)
     elif window.high - window.low < MIN_WINDOW:

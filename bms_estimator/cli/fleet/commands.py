@@ -14,6 +14,9 @@ COMMANDS = {
     "user": LazyCommand(
         "bms_estimator.cli.fleet.serve:user", "Print the token with which the edge of a pack connects."
     ),
+    "users": LazyCommand(
+        "bms_estimator.cli.fleet.serve:users", "Write the tokens of the edges of all packs of a table."
+    ),
     "worker": LazyCommand(
         "bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."
     ),

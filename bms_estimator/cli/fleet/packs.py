@@ -33,7 +33,7 @@ def load(
     table: Annotated[
         Path,
         typer.Argument(
-            help="CSV file with the columns pack, cell, capacity_ah, series ... (docs/fleet/packs.md)",
+            help="CSV file with the columns pack, cell, capacity_ah, series ... (docs/fleet/index.md)",
             show_default=False,
         ),
     ],

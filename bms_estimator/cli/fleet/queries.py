@@ -112,7 +112,7 @@ def ask(
         limits = duckdb_queries.Limits(within_days=within)
         answer = duckdb_queries.run_query(folder, name, days=days, limits=limits)
     for note in answer.notes:
-        typer.echo(f"warning: {note}", err=True)
+        typer.echo(f"note: {note}", err=True)
     (_print_json if json else _print_csv if csv else _print_table)(answer)
 
 

@@ -8,7 +8,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
@@ -58,16 +58,14 @@ class Query(NamedTuple):
 
 
 QUERIES = {
-    "soh": Query(("days", "packs", "fits"), "capacity trend a year with its band, of each type and pack"),
+    "soh": Query(("days", "packs", "points", "fits"), "capacity trend a year with its band, of each type and pack"),
     "outliers": Query(("days", "packs"), "packs whose capacity or R_s deviates from their type"),
-    "failing": Query(("days", "packs", "fits"), "packs that will soon reach a limit, or have recent input faults"),
+    "failing": Query(
+        ("days", "packs", "points", "fits"),
+        "packs with a faulty cell, that will soon reach a limit, or that have recent input faults",
+    ),
     "honest": Query(("days", "packs"), "how often the SOC was within 2 std, compared with later estimates"),
     "silent": Query(("days", "packs"), "packs of which nothing has arrived recently, or ever"),
-    "weak-cells": Query(("days", "packs"), "packs in which one series cell is below the others in most recent hours"),
-    "imbalance": Query(("days", "packs"), "packs whose cells differ in SOC, and the trend of the difference"),
-    "self-discharge": Query(
-        ("days", "packs"), "cells that discharge themselves, for example by an internal short, with their current"
-    ),
     "clocks": Query(("server_errors",), "wrong clocks of edges, whose hours may be quarantined, and of the server"),
 }
 
@@ -85,20 +83,22 @@ class Limits:
     r_s_fresh_s: float = 86_400.0
     """Maximum time since R_s was last identified [s]; older values are not used."""
     min_days: int = 7
-    """Queries soh, failing, imbalance: minimum number of days in a trend."""
+    """Queries soh, failing: minimum number of days in a trend."""
     min_packs: int = 5
     """Query outliers: minimum number of packs with a valid value that define the reference of their type."""
     min_spread: float = 0.01
     """Query outliers: lower bound of the relative standard deviation between packs of a type."""
     recent_days: int = 3
     """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault.
-    Queries weak-cells, imbalance and self-discharge use the rows of these days."""
-    weak_cell_soc: float = 0.05
-    """Query weak-cells: minimum mean deviation of the weakest cell below the mean of the cells [SOC]."""
-    imbalance_soc: float = 0.05
-    """Query imbalance: minimum difference between the highest and the lowest cell [SOC]."""
+    Faulty cells are those of more than half of the hours of these days."""
+    weak_cell_soc: float = 0.03
+    """Query failing: SOC below the mean of the cells by which a cell lies at least, three standard deviations being subtracted."""
+    small_cell_ratio: float = 0.9
+    """Query failing: upper limit of the capacity of a cell, relative to the median of the cells."""
+    resistive_cell_ratio: float = 1.25
+    """Query failing: lower limit of the resistance of a cell, relative to the median; two standard deviations are subtracted."""
     self_discharge_c: float = MIN_SHORT_C
-    """Query self-discharge: minimum self-discharge of a cell above the median cell, as a C-rate [1/h]."""
+    """Query failing: minimum self-discharge of a cell above the median cell, as a C-rate [1/h]."""
     silent_hours: int = 2
     """Query silent: maximum time since the last summary arrived [h]. The summary of an hour arrives in the next hour."""
     min_server_packs: int = 3
@@ -159,7 +159,16 @@ def run_query(
             _run(database, _sql(table), parameters)
             if table == "packs":  # the limit depends on the number of packs
                 parameters["stds"] = _reporting_limit_stds(database)
-        return _answer(_run(database, _sql(name), parameters), present.notes)
+        answer = _answer(_run(database, _sql(name), parameters), present.notes)
+        if name == "soh" and not answer.rows:
+            measured_days = "SELECT count(DISTINCT pack), coalesce(max(n), 0) FROM (SELECT pack, count(*) AS n FROM points WHERE quantity = 'capacity' GROUP BY pack)"
+            ((packs, most),) = database.execute(measured_days).fetchall()
+            text = (
+                f"no trend yet: it needs {limits.min_days} days on which the capacity of a pack was measured, by a large change of its SOC; "
+                f"so far {packs} packs have such days, at most {most}"
+            )
+            answer = replace(answer, notes=(*answer.notes, text))
+        return answer
 
 
 def select(folder: Path, query: str, *, days: int | None = None) -> Answer:

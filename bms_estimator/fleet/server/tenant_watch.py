@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.backlog import undelivered_messages
 from bms_estimator.fleet.nats.connection import close
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S
-from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
+from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
 from bms_estimator.fleet.server.arrival_watch import ArrivalWatch
 from bms_estimator.fleet.server.local_client import connect
 from bms_estimator.fleet.server.nats_config import Node
@@ -109,10 +109,13 @@ class TenantWatch:
         arrivals = ArrivalWatch(nc)
         while not closed.is_set():
             self._silent = await arrivals.silent_packs(time.monotonic())
-            self._unsaved_share = await unsaved_share(nc, range(self._node.partitions))
-            if warning := unsaved_warning(self._unsaved_share):
+            unsaved = await unsaved_blocks(nc, range(self._node.partitions))
+            self._unsaved_share = unsaved.share
+            if unsaved.warning:
                 log.warning(
-                    "the stream fills with blocks that no checkpoint includes", tenant=self._name, reason=warning
+                    "the stream fills with blocks that no checkpoint includes",
+                    tenant=self._name,
+                    reason=unsaved.warning,
                 )
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CHECK_S):

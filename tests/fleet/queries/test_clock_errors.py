@@ -133,6 +133,6 @@ def test_command_prints_the_warning_and_repairs_the_files(tmp_path, capsys):
     write(tmp_path, [*rows, make_hour("b", now - 1, revision=2, received_hour=now + 48)])
     code, out, err = run(capsys, "fleet", "ask", "silent", "--folder", tmp_path)
     assert (code, out.splitlines()[-1]) == (0, "none")
-    assert err.startswith("warning: 1 rows of 1 packs arrived in the future by the server's clock")
+    assert err.startswith("note: 1 rows of 1 packs arrived in the future by the server's clock")
     assert run(capsys, "fleet", "repair", "--folder", tmp_path) == (0, f"{tmp_path}: 1 row repaired\n", "")
     assert run(capsys, "fleet", "ask", "silent", "--folder", tmp_path)[2] == ""

@@ -177,7 +177,7 @@ def test_the_figure_of_a_missing_load_is_empty_with_a_reason(samples, remaining,
 
 
 def test_errors_of_the_leaf_cell_are_those_of_the_document(leaf_procedure):
-    """The document is docs/theory/chapter5.md."""
+    """The document is docs/theory/thesis.md."""
     run, (soc, _) = leaf_procedure.dynamic["cc"], leaf_procedure.interpolated("cc")
     assert (run.mean_percent, run.max_percent) == pytest.approx((0.543, 2.37), abs=0.005)
     assert leaf_procedure.static["cc"].mean_percent == pytest.approx(0.517, abs=0.005)
