@@ -13,7 +13,7 @@ from bms_estimator.estimator.fitted_state import FittedState, write_fitted_state
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, add_reference, complete_row
-from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR
+from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR, apply_prior
 from bms_estimator.kernels.kalman_filter.hypotheses import USER_SOC_STD, set_soc, weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
@@ -186,6 +186,13 @@ class Estimator:
                 # no previous sample: if the sensor freezes now, the SOC before this call must not be restored
                 c["last_v"] = 0.0
             store_last_good_state(c, f)
+
+    def add_prior(self, soc: float, std: float) -> None:
+        """Correct the SOC of a new pack by the SOC 0..1 that its device reports, with a std. Call this after the first sample."""
+        f, c = self.record[0]["filter"], self.record[0]["checks"]
+        apply_prior(f, soc, std)
+        self.state["soc"] = f["soc"]
+        store_last_good_state(c, f)
 
     def use_curves(self, settings: np.void) -> None:
         """Use the curves of another record of dtype EKF_SETTINGS. R_s in ohm does not change."""

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,6 +100,7 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
         raise UserError(f"systemd-sysusers did not create the group {places.NAME}")
     report("user", f"{places.NAME}, in group dialout")
     if pack is not None:
+        _require_same_pack(machine, pack)
         _write_settings(machine, pack, group, report)
     _set_settings_group(machine, group)
     for file in system_files(machine, program):
@@ -152,6 +154,35 @@ def _link_program(machine: Machine, program: Path, report: Report) -> None:
     link.unlink(missing_ok=True)
     link.symlink_to(program)
     report("program", f"{places.PROGRAM_LINK}, a link to {program}")
+
+
+def _require_same_pack(machine: Machine, pack: PackFiles) -> None:
+    """Refuse to replace the settings of another pack.
+
+    Raises:
+        UserError: The installed settings are of another pack. The message has the commands that install this one beside it.
+    """
+    installed = machine.read(places.PACK_FILE)
+    before = installed and _pack_name(installed)
+    name = _pack_name(pack.settings.read_bytes())
+    if before and before != name:
+        target = places.SETTINGS / f"{name}.toml"
+        files = " ".join(map(str, pack.named))
+        copy = f"\n  sudo install -m 640 -g {places.NAME} {files} {places.SETTINGS}" if files else ""
+        raise UserError(
+            f"{places.PACK_FILE}: is the pack {before}, and {pack.settings} is {name}; to run both:{copy}\n"
+            f"  sudo install -m 640 -g {places.NAME} {pack.settings} {target}\n"
+            f"  sudo systemctl enable --now {places.NAME}@{name}\n"
+            f"to replace {before}, remove {places.PACK_FILE} first"
+        )
+
+
+def _pack_name(settings: bytes) -> str | None:
+    """Return the name of the pack in settings; None if they cannot be read."""
+    try:
+        return str(tomllib.loads(settings.decode()).get("pack", {}).get("name", "pack"))
+    except ValueError:
+        return None
 
 
 def _write_settings(machine: Machine, pack: PackFiles, group: int, report: Report) -> None:

@@ -99,6 +99,10 @@ class PackSettings(PackValues, _PackNames):
         default=None,
         description="largest discharge current of the pack by its rating or its BMS, which bounds the available power; default: 1 C, or the largest current that the pack has supplied for a second",
     )
+    device_soc_std: Annotated[float, Field(gt=0, le=0.5)] | None = Field(
+        default=None,
+        description="standard deviation 0..0.5 of the SOC that the device reports, such as 0.1; a new pack starts with this SOC as a prior; default: the SOC of the device is not used",
+    )
     max_charge_a: Positive | None = Field(
         default=None,
         description="largest charge current of the pack by its rating or its BMS, which bounds the available power; default: C/2, or the largest current that the pack has accepted for a second",

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.forecast.forecast import FORECAST, Forecast, unknown_values
-from bms_estimator.kernels.accumulators.soc_certainty import MIN_UNKNOWN_STD
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -60,8 +59,8 @@ def clock_duration(duration_s: float) -> str:
     return f"{hours}:{minutes:02d}"
 
 
-UNKNOWN_SOC = f"the SOC is not known yet: it is known once its standard deviation has fallen below {100.0 * MIN_UNKNOWN_STD:.0f} %"
-"""Reason without a known SOC."""
+UNKNOWN_SOC = "the SOC is not known yet: charge the pack to full once, or let it rest for ten minutes"
+"""Reason without a known SOC, and what helps."""
 ALWAYS_STABLE = "the thesis's model is valid at each SOC: delta_1 and delta_2 are not above 0"
 """Reason with capacitances that are positive at each SOC."""
 NOT_IDENTIFIED = "delta_1 and delta_2 follow from a7..a12, which are not valid: see the topic parameters"
@@ -179,6 +178,7 @@ def make_state_payload(
     flow: ChargeEnergy,
     capacity_ah: float | None,
     cell_fields: Mapping[str, Any] = MappingProxyType({}),
+    device_soc: float | None = None,
 ) -> Estimate:
     """Return the payload of topic ``state``.
 
@@ -191,11 +191,13 @@ def make_state_payload(
         flow: Charge and energy at the terminals.
         capacity_ah: Rated capacity of the pack [Ah]; None for a fuel cell.
         cell_fields: Fields about single cells (``weakest_cell_fields``).
+        device_soc: SOC that the device reports, 0..1; None: not reported.
     """
     # a tuple of plain numbers, because reading the fields of a numpy record one by one is slow
     values = zip(TRACE.names or (), window.last.item(), strict=True)
     last = {name: value if math.isfinite(value) else None for name, value in values}
     innovation_v, soc, margin = last["innovation_v"], last["soc"], finite(known_margin(window.last, window.soc_known))
+    is_known = soc is not None and window.soc_known
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
@@ -209,7 +211,9 @@ def make_state_payload(
         **{name: last[name] for name in COPIED},
         voltage_estimate_v=None if innovation_v is None else window.voltage_v - innovation_v,
         soc_percent=None if soc is None else 100.0 * soc,
-        soc_known=soc is not None and window.soc_known,
+        soc_known=is_known,
+        device_soc=device_soc,
+        device_soc_difference=soc - device_soc if soc is not None and is_known and device_soc is not None else None,
         stability_margin=margin,
         stability_margin_std=None if margin is None else last["stability_margin_std"],
         stability_margin_reason=missing_margin_reason(window.last, soc_known=window.soc_known),

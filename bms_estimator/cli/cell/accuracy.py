@@ -12,14 +12,14 @@ import typer
 
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.options.capture_options import CELL_HELP, AsJson, CapacityAh, complete_battery
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.pack_options import pack_or_cell
 from bms_estimator.cli.options.table import print_table
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.process.state_folder import state_folder
@@ -81,8 +81,8 @@ def accuracy(
     if pack is None:
         window = Window(0.0, has_temperature=False)
     else:
-        with show_compile_progress():
-            window, present_std, full_charges = _use_of_pack(settings, model)
+        compile_ahead()
+        window, present_std, full_charges = _use_of_pack(settings, model)
     if between is not None:
         window = _with_ends(window, *between)
     curves = CellCurves(make_estimator(settings, model).cell_file_settings)
@@ -114,10 +114,9 @@ def _use_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, i
     """
     files = StateFiles(state_folder(settings), settings, model)
     saved = files.saved_pack().pack
-    rows = saved.slow_fit.history.rows if saved.slow_fit else np.zeros(0)
-    if saved.slow_fit is None or rows.size == 0:
+    if saved.slow_fit is None or saved.slow_fit.history.rows.size == 0:
         raise UserError(f"{files.history.path}: no history of the use yet; give --between LOW HIGH")
-    fit = saved.slow_fit.saved_fit
+    rows, fit = saved.slow_fit.history.rows, saved.slow_fit.saved_fit
     soc = np.clip(rows["soc"] if fit is None else fit.row_soc, 0.0, 1.0)
     full_charges = int((rows["reference_kind"] == FULL).sum())
     has_temperature = bool(saved.estimator.record[0]["filter"]["sensed"])
