@@ -23,7 +23,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb addon docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month bank cells observability power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema compile-order notebook lock
+.PHONY: help venv apt audit check deb addon docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month bank cells power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema compile-order notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -107,9 +107,6 @@ bank: venv ## the weakest cell of simulated banks: false alarms, detection and e
 
 cells: venv ## single cells of simulated packs: shorts and false alarms, beside three other detectors: minutes
 	@$(BIN)/python -m tests.benchmarks.cells $(ARGS)
-
-observability: venv ## the lower bound of the std of the SOC by cell and SOC window, e.g. make observability ARGS="lfp --window 0.5 0.95"
-	@$(BIN)/python -m tests.benchmarks.observability $(ARGS)
 
 forecast: venv ## forecasts of the time to cut-off on real captures, e.g. make forecast ARGS="n10_us06 leaf": half an hour
 	@$(BIN)/python -m tests.benchmarks.forecast $(ARGS)

@@ -22,7 +22,7 @@ from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.kernel_compilation import compile_kernels
 from bms_estimator.settings.alarm_limits import MIN_CELLS
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
@@ -60,6 +60,7 @@ def _call_kernels() -> None:
     known_rows(trace, False)
     pack = cell.pack(MIN_CELLS, 1)
     CellEstimator(new_estimator(Settings(), pack)).run(sample, np.zeros((1, MIN_CELLS)), trace)
+    estimator.add_prior(0.5, 0.1)
     estimator.set_soc(0.5)
     estimator.resume(0.0)
     make_parameters_payload(estimator, 0.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.doctor import kernel_check
-from bms_estimator.doctor.disk_check import check_disk
+from bms_estimator.doctor.examine import check_disk
 from bms_estimator.doctor.finding import Level
 from bms_estimator.doctor.kernel_check import check_kernels
 from bms_estimator.numba_cache import source_digest

@@ -27,7 +27,7 @@ from bms_estimator.cli.options.capture_options import (
 from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.cli.options.silenced_log import silenced_log
+from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.pack_model import PackModel
@@ -120,7 +120,7 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
         async for each in source:
             received = each._replace(cells_v=slots.select(each.cells_v))
             now_s = max(now_s, float(received.samples["time_s"][-1]))
-            monitor.add(received, pack.run(received.samples, received.cells_v), now_s, slots.fault)
+            monitor.add(received, pack.run(received.samples, received.cells_v, received.device_soc), now_s, slots.fault)
             bar.update(source.fraction)
     if slots.reason:
         typer.echo(f"warning: no estimates of single cells: {slots.reason}", err=True)

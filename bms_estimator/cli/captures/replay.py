@@ -54,8 +54,8 @@ from bms_estimator.sources.captures.replay import RawCapture, Replay, no_samples
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.cells import cell_columns
-from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
+from bms_estimator.telemetry.state import CUTOFF_FIELDS, cutoff_text
 
 CELLS_S = 10.0
 """Interval at which the columns of the cells are updated [s]. It equals the averaging window of the cell estimator."""
@@ -175,7 +175,7 @@ async def _replay(
         async for each in source:
             received = each._replace(cells_v=slots.select(each.cells_v))
             for part in rows.parts(received):
-                step = pack.run(part.samples, part.cells_v)
+                step = pack.run(part.samples, part.cells_v, part.device_soc)
                 summary.add(step.trace)
                 rows.add(step)
                 if step.trace.size < part.samples.size:  # samples were dropped
@@ -218,7 +218,9 @@ class _TableRows:
         edges = [0, *(np.flatnonzero(changes) + 1).tolist(), received.samples.size]
         for begin, end in itertools.pairwise(edges):
             part = slice(begin, end)
-            yield ReceivedSamples(received.samples[part], received.cells_v[part], received.probes[part])
+            yield ReceivedSamples(
+                received.samples[part], received.cells_v[part], received.probes[part], received.device_soc[part]
+            )
 
     def add(self, step: Step) -> None:
         """Append the rows of a part."""

@@ -41,7 +41,7 @@ from bms_estimator.service.forecast_request import as_json_data
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import open_capture
 from bms_estimator.sources.captures.trip_file import read_trip
-from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
+from bms_estimator.telemetry.state import CUTOFF_FIELDS, cutoff_text
 
 PLOT_FORMATS = (".png", ".svg", ".pdf")
 """Allowed extensions of the plot file."""

@@ -17,7 +17,7 @@ import typer
 from bms_estimator.cli.options.capture_options import AsJson
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.cli.options.silenced_log import silenced_log
+from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.doctor.device_check import load_decoder
 from bms_estimator.doctor.examine import examine
 from bms_estimator.doctor.finding import Finding, Level, fault
