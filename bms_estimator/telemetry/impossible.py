@@ -6,6 +6,14 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.alarms import (
+    MAX_SPREAD_V,
+    MAX_SUM_DIFFERENCE,
+    MEAN_HIGH_V,
+    MEAN_LOW_V,
+    MILLI,
+    MIN_MEAN_V,
+)
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
@@ -17,19 +25,8 @@ MAX_C_RATE = 100.0
 the fuse or the cell ends within a second."""
 MAX_CURRENT_RATIO = 10.0
 """Highest possible current of a fuel cell in multiples of its maximum current. Its limiting current density is lower."""
-MIN_MEAN_V = -1.0
-"""Lowest possible mean voltage of the cells of a pack [V]. A reversed cell reaches it, but never all cells at once."""
-MEAN_RANGE_V = 1.0, 5.0
-"""Range of the mean voltage of undamaged cells of any chemistry [V]."""
-MAX_SUM_DIFFERENCE = 0.2
-"""Highest possible difference between the pack's voltage and the sum of its cells, as a fraction of the higher one. Wires and
-contactors drop a few percent."""
-MAX_SPREAD_V = 1.0
-"""Maximum difference between cells that confirm each other [V]."""
 FACTORS = 10, 100, 1000
 """Usual factors between the scales or units of two devices."""
-MILLI = 1000.0
-"""Factor of a voltage in mV that is read as V."""
 FACTOR_TOLERANCE = 0.1
 """Tolerance of a ratio that shows one of the factors."""
 MIN_SWAPPED = 1e7
@@ -87,9 +84,7 @@ class PackBounds(NamedTuple):
         differs = (count == self.series) & (
             np.abs(pack_mean_v - mean_v) > MAX_SUM_DIFFERENCE * np.maximum(np.abs(pack_mean_v), np.abs(mean_v))
         )
-        pack_is_usual, cells_are_usual = (
-            (MEAN_RANGE_V[0] <= v) & (v <= MEAN_RANGE_V[1]) for v in (pack_mean_v, mean_v)
-        )
+        pack_is_usual, cells_are_usual = ((v >= MEAN_LOW_V) & (v <= MEAN_HIGH_V) for v in (pack_mean_v, mean_v))
         contradicts = differs & cells_are_usual
         cells_agree = highest_v - lowest_v <= MAX_SPREAD_V
         is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0

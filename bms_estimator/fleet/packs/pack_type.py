@@ -17,6 +17,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.fleet.packs.alarm_definitions import AlarmDefinitions
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.fuel_cell import PackModel
 from bms_estimator.pack.pack import Pack, assemble
@@ -42,6 +43,7 @@ class PackType:
         config_digest: Digest of the configuration of the estimator. A state of another digest is migrated.
         state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
         pack: Pack whose estimator is bound to the unpacked record of the partition, without forecasts.
+        alarms: Definitions of the alarms.
         short_limit_a: Minimum proven self-discharge of a cell with an internal short [A].
         meter: Charge and energy meter bound to the unpacked record.
         capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
@@ -54,6 +56,7 @@ class PackType:
     config_digest: Digest
     state_digest: Digest
     pack: Pack
+    alarms: AlarmDefinitions
     short_limit_a: float
     meter: ChargeEnergyMeter
     capacity_ah: float | None
@@ -180,6 +183,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], adv
         config_digest=digest,
         state_digest=state_digest(settings, cell),
         pack=assemble(estimator, settings, new_fit, has_load=False),
+        alarms=AlarmDefinitions.of(settings, cell, float(estimator.settings["gap_s"][0])),
         short_limit_a=short_limit_a(settings, cell),
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,

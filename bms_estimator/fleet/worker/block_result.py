@@ -10,6 +10,13 @@ INTERNAL_ERROR = "internal error; the log of the worker has the traceback"
 """Reason for the dead letter of a block that was skipped because of an internal error."""
 
 
+class AlarmMessage(NamedTuple):
+    """Message about an alarm or event of a pack."""
+
+    topic: str
+    payload: bytes
+
+
 class HistoryMessage(NamedTuple):
     """Rows of a pack's history, or a request for a fit, which the server stores."""
 
@@ -28,6 +35,7 @@ class BlockResult(NamedTuple):
         state: Payload of topic ``state``; None without one.
         parameters: Payload of topic ``parameters``; None without one.
         cells: Payload of topic ``cells``; None without one.
+        alarms: Changed alarms and events, oldest first; once an hour all raised and unwatched alarms.
         hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
             drops repeated rows.
         history: Messages of the pack's history.
@@ -40,6 +48,7 @@ class BlockResult(NamedTuple):
     state: bytes | None = None
     parameters: bytes | None = None
     cells: bytes | None = None
+    alarms: tuple[AlarmMessage, ...] = ()
     hours: tuple[tuple[str, bytes], ...] = ()
     history: tuple[HistoryMessage, ...] = ()
     failed: int = 0

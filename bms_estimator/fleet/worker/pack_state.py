@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.restore import copy_known_fields
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
+from bms_estimator.kernels.alarms import ALARMS
 from bms_estimator.kernels.cells.records import BANK, CELL
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
@@ -108,6 +109,7 @@ PACK_STATE = np.dtype(
         ("flow", FLOW),
         ("hour", HOUR_SUMS),
         ("fit", FIT),
+        ("alarms", ALARMS),
         ("estimator", ESTIMATOR_STATE),
     ],
     align=True,

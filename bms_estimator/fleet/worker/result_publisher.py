@@ -14,6 +14,8 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.worker.block_result import BlockResult, HistoryMessage
 
+MAX_MERGED_ALARMS = 256
+"""Maximum number of messages about alarms and events of a pack that are published after a replay of the stream, the newest."""
 MAX_PENDING = 128
 """Maximum number of published messages that wait for the server's acknowledgment."""
 
@@ -99,13 +101,14 @@ class ResultPublisher:
             return
         if result.reply is not None:
             await self._nc.publish(subjects.block_request(result.pack), result.reply.model_dump_json().encode())
-        for topic, payload in (("state", result.state), ("parameters", result.parameters), ("cells", result.cells)):
+        topics = ("state", result.state), ("parameters", result.parameters), ("cells", result.cells), *result.alarms
+        for topic, payload in topics:
             if payload is not None:
                 await self._nc.publish(subjects.published(result.pack, topic), payload)
 
 
 def merge(before: BlockResult | None, result: BlockResult) -> BlockResult:
-    """Merge two successive results of one pack: the newest reply and payloads."""
+    """Merge two successive results of one pack: the newest reply and payloads, and all alarms and events."""
     if before is None:
         return result
     return result._replace(
@@ -113,4 +116,5 @@ def merge(before: BlockResult | None, result: BlockResult) -> BlockResult:
         state=result.state or before.state,
         parameters=result.parameters or before.parameters,
         cells=result.cells or before.cells,
+        alarms=(before.alarms + result.alarms)[-MAX_MERGED_ALARMS:],
     )

@@ -5,15 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bms_estimator.kernels.alarms import CELLS_GAP_S
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
 
 if TYPE_CHECKING:
     from bms_estimator.settings.alarms import AlarmName
-
-CELLS_GAP_S = 60.0
-"""Minimum length of a gap between two evaluations of the single cells [s]."""
 
 
 class CellAlarms:

@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bms_estimator.kernels.alarms import FRACTION_S
 from bms_estimator.model.arrays import Floats
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
 
-INTERVAL_S = 1.0
-"""Minimum interval over which the fraction is computed [s]."""
+UNUSABLE_KINDS = "not_finite", "range", "saturated"
+"""Kinds of dropped samples that indicate a sensor fault."""
 
 
 class SampleCounts(NamedTuple):
@@ -30,7 +31,7 @@ class FaultyFraction:
         self._counted_s = -math.inf
 
     def update(self, at_s: float, counts: SampleCounts) -> tuple[Floats, float] | None:
-        """Return the time since the last call [s], shape (1,), and the fraction; None before ``INTERVAL_S`` has passed.
+        """Return the time since the last call [s], shape (1,), and the fraction; None before ``FRACTION_S`` has passed.
 
         The fraction is NaN without a sample.
 
@@ -38,7 +39,7 @@ class FaultyFraction:
             at_s: Time of the last sample on the samples' clock [s].
             counts: Numbers of samples since start.
         """
-        if 0.0 <= at_s - self._counted_s < INTERVAL_S:
+        if 0.0 <= at_s - self._counted_s < FRACTION_S:
             return None
         before, self._counts, self._counted_s = self._counts, counts, at_s
         _, observed_s = self._intervals.measure(np.array([at_s]))

@@ -5,11 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bms_estimator.kernels.alarms import RECENT_STEPS
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.arrays import Floats
-
-RECENT_STEPS = 4.0
-"""Maximum time between two intervals above ``gap_s`` that count as regular, in multiples of the longer interval."""
 
 
 @dataclass
