@@ -103,6 +103,7 @@ month: venv ## SOC error over simulated weeks of use, day by day, e.g. make mont
 
 bank: venv ## the weakest cell of simulated banks: false alarms, detection and error of its SOC: up to 10 minutes
 	@$(BIN)/python -m tests.benchmarks.bank $(ARGS)
+	@$(BIN)/python -m tests.benchmarks.fleet.failing_packs
 
 cells: venv ## single cells of simulated packs: shorts and false alarms, beside three other detectors: minutes
 	@$(BIN)/python -m tests.benchmarks.cells $(ARGS)

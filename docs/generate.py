@@ -12,13 +12,10 @@ from mkdocs.structure.files import File, Files
 from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
 from bms_estimator.fleet.metrics import definitions as fleet_definitions
-from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.forecast import ForecastReport
 from bms_estimator.model.payloads.health import Health
-from bms_estimator.model.payloads.info import Info
-from bms_estimator.model.payloads.parameters import ParameterReport
 from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.snapshot import Alarm, CellsReport, ForecastReport, Info, ParameterReport
 from bms_estimator.reports.thesis.report import build
 from bms_estimator.reports.thesis.report_items import Table
 from bms_estimator.reports.thesis.report_items import name as item_name
@@ -32,6 +29,7 @@ PAYLOADS: dict[str, type[Payload]] = {
     "health": Health,
     "info": Info,
     "alarm": Alarm,
+    "cells": CellsReport,
 }
 
 
@@ -129,7 +127,7 @@ def command(title: str, target: object, summary: str) -> Iterator[str]:
 
 def fleet_metrics() -> Iterator[str]:
     """Yield the page of the metrics of a fleet, with their labels and the kinds of events."""
-    yield "# Metrics of a fleet\n\n[Metrics](../fleet/metrics.md) explains where Prometheus reads them.\n"
+    yield "# Metrics of a fleet\n\n[Metrics](../fleet/operation.md#metrics-and-alerts) explains where Prometheus reads them.\n"
     for title, labels, metrics in (
         ("Node of the server", [], fleet_definitions.NODE),
         ("Tenant", ["tenant"], fleet_definitions.TENANT),

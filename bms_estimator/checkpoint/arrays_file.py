@@ -1,6 +1,10 @@
-"""Files of arrays beside the checkpoint of the same pack: the history with its last fit, and the observed load."""
+"""Files of arrays beside the checkpoint of the same pack, and the identities by which both belong to a pack.
+
+The files have the history with its last fit, and the observed load.
+"""
 
 import contextlib
+import hashlib
 import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -9,10 +13,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.identity import pack_identity
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.pack import Settings
+
+
+def pack_identity(settings: Settings, cell: PackModel) -> str:
+    """Return the hash of all numbers on which the meaning of a state depends.
+
+    For a battery, these are the number of cells in series, the capacity, the open-circuit voltage and the sign of the
+    current. For a fuel cell, these are all parameters and the sign of the current. A changed description, tuning value
+    or other setting does not change the hash.
+    """
+    return hashlib.sha256(repr(cell.state_basis(settings.sensor.current_sign)).encode()).hexdigest()
+
+
+def observer_identity(settings: Settings, cell: PackModel) -> str:
+    """Return the hash of all settings and cell data on which the observer's parameters and gain depend.
+
+    With another hash the observer's own state is discarded; it converges again within seconds.
+    """
+    parts = (settings.observer, cell, settings.sensor.voltage_resolution_v)
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def without_observer(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return the fields of a state that stay valid with another observer identity."""
+    valid = "observer.soc", "observer.soc_coulomb", "observer.started"
+    # ``learning`` and ``series_resistance`` are computed from the observer's estimates and are discarded with them
+    prefixes = "observer.", "learning.", "series_resistance."
+    return {name: v for name, v in state.items() if name in valid or not name.startswith(prefixes)}
+
 
 FORMAT = 1
 """Version of the file's layout. Increment it when a field changes its meaning."""

@@ -16,7 +16,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.checksum import CHECKSUM_BYTES, add_checksum, verify_checksum
+from bms_estimator.checkpoint.run_file import CHECKSUM_BYTES, add_checksum, verify_checksum
 from bms_estimator.model.arrays import fields
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.process.private_file import read_private, write_private

@@ -1,9 +1,13 @@
-"""File with counters and alarms of a pack. It has the pack's name only, so that no edited setting loses them."""
+"""File with counters and alarms of a pack. It has the pack's name only, so that no edited setting loses them.
+
+Checksum in the first line of a file, so that any damage is recognized.
+"""
 
 import contextlib
 import io
 import json
 import re
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -13,11 +17,31 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.checksum import add_checksum, verify_checksum
-from bms_estimator.model.payloads.totals import Totals
+from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.private_file import overwrite_private, read_private, write_private
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.lifetime_totals import new_totals
+
+CHECKSUM_BYTES = 9
+"""Length of the first line [bytes]."""
+
+
+def add_checksum(body: bytes) -> bytes:
+    """Return ``body`` after a line with its CRC-32."""
+    return b"%08x\n%b" % (zlib.crc32(body), body)
+
+
+def verify_checksum(content: bytes) -> bytes:
+    """Return the body of a file that ``add_checksum`` made.
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    line, _, body = content.partition(b"\n")
+    if line != b"%08x" % zlib.crc32(body):
+        raise ValueError("its checksum is wrong")
+    return body
+
 
 FORMAT = 1
 """Version of the file's layout. Increment it when a key changes its meaning."""

@@ -1,23 +1,225 @@
-"""All files of a pack's state: checkpoint, history with its last fit, observed load, and counters with alarms."""
+"""All files of a pack's state: checkpoint, history with its last fit, observed load, and counters with alarms.
 
-from collections.abc import Callable
-from dataclasses import replace
+A state is restored only if it is valid and belongs to the pack. Each ``pack_identity`` has its own checkpoint with named
+fields. Therefore no state is lost if settings are edited or a version with other fields is installed.
+"""
+
+import contextlib
+import math
+import os
+import re
+import secrets
+import shlex
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import structlog
+from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.arrays_file import HISTORY_SUFFIX, LOAD_SUFFIX, ArraysFile, RejectedFileError
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.arrays_file import (
+    HISTORY_SUFFIX,
+    LOAD_SUFFIX,
+    ArraysFile,
+    RejectedFileError,
+    damage_rejected,
+    observer_identity,
+    pack_identity,
+    read_arrays,
+    set_aside,
+    without_observer,
+    write_arrays,
+)
+from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, Base, ChangesFile
 from bms_estimator.checkpoint.run_file import RunFile, SavedRun
+from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
-from bms_estimator.pack.state import CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, PackState
+from bms_estimator.pack.state import CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, Declared, PackState
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
 from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.settings.pack import Settings
+
+FORMAT = 8
+"""Version of the file's layout. Increment it when a field changes its meaning, and migrate files of the previous
+version."""
+FORMER_FORMAT = 7
+"""Version of files that also contain counters and alarms. ``RunFile`` migrates these."""
+DAY_S = 86400.0
+"""Length of a day [s]."""
+MAX_FILE_BYTES = 1 << 20
+"""Maximum size of a checkpoint file [bytes]. A file of the former format has about 112 kB."""
+MAX_FILES = 8
+"""Maximum number of checkpoint files of one pack; older ones are deleted."""
+MAX_LATER_FILES = 4
+"""Maximum number of quarantined files of later formats, which serve a return to the later version."""
+_CELLS = "cells."
+"""Prefix of the names of the arrays of single cells in the file."""
+_CURVES = "fit."
+"""Prefix of the names of the fit's arrays in the file."""
+
+
+class CheckpointFile:
+    """One pack's checkpoint, ``<pack.name>-<identity>.npz``.
+
+    Args:
+        folder: Folder of the file.
+        settings: The pack's settings.
+        cell: Model of the whole pack.
+        now: Clock that also identifies the boot.
+    """
+
+    def __init__(
+        self, folder: Path, settings: Settings, cell: PackModel, now: Callable[[], BootTimestamp] = boot_timestamp
+    ) -> None:
+        self._name, self._now = settings.pack.name, now
+        self._identity, self._observer = pack_identity(settings, cell), observer_identity(settings, cell)
+        self._declared = Declared.by(cell)
+        self._longest_days = settings.state.longest_days
+        self._is_later = False  # the file has a later format
+        self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
+        self._changes = ChangesFile(self.path)
+        self.disk_free_mib: float | None = None
+        """Free space on the disk at the last write [MiB]."""
+
+    def save(
+        self,
+        state: NDArray[np.void],
+        curves: Mapping[str, NDArray[Any]] | None = None,
+        cells: Mapping[str, NDArray[Any]] | None = None,
+        *,
+        whole: bool = False,
+    ) -> None:
+        """Write the file, or only its changes, atomically: after a power cut either the old or the new state exists.
+
+        A missing folder is created.
+
+        Args:
+            state: Shape (1,), dtype ESTIMATOR_STATE.
+            curves: Arrays of the fit to whose curves the state is relative; None or empty: those of the cell file.
+            cells: State of the estimators of single cells; None or empty without cell voltages.
+            whole: True: write the whole file.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        disk = os.statvfs(self.path.parent)
+        self.disk_free_mib = disk.f_bavail * disk.f_frsize / 2**20
+        now, curves = self._now(), curves or {}
+        if not whole and self.path.exists() and self._changes.save(state, curves, now):
+            return
+        token = secrets.token_hex(8)
+        content: dict[str, Any] = {
+            "format": FORMAT,
+            "identity": self._identity,
+            "observer": self._observer,
+            "token": token,
+            "state": state,
+            **asdict(now),
+            **(self._declared._asdict() if self._declared else {}),
+        }
+        content |= {f"{_CURVES}{name}": array for name, array in curves.items()}
+        content |= {f"{_CELLS}{name}": array for name, array in (cells or {}).items()}
+        write_arrays(self.path, content)
+        self._changes.set_base(Base(token, state.copy(), curves, now))
+        self._remove_oldest()
+
+    def load(self) -> PackState:
+        """Read the state of estimator and single cells. An error is returned in the result's ``reasons``."""
+        try:
+            with damage_rejected():
+                return self._validate(read_arrays(self.path, MAX_FILE_BYTES))
+        except FileNotFoundError:
+            return PackState(reasons={CHECKPOINT: "none found"})
+        except RejectedFileError as error:
+            return PackState(reasons={CHECKPOINT: f"{REFUSED}{error}"})
+
+    @property
+    def saved_ns(self) -> int:
+        """Time of the last save [ns since 1970]; 0 without a file."""
+        paths = [self.path, *(self.path.with_suffix(suffix) for suffix in CHANGES_SUFFIXES)]
+        return max((path.lstat().st_mtime_ns for path in paths if path.exists()), default=0)
+
+    def other_declared(self) -> Iterator[tuple[Path, Declared]]:
+        """Yield the pack's other checkpoints with a declared capacity. Damaged files are ignored."""
+        for path in self._other_paths():
+            with contextlib.suppress(Exception):  # a damaged file may raise anything
+                file = read_arrays(path, MAX_FILE_BYTES)
+                declared = Declared(*(float(file[name]) for name in Declared._fields))
+                if all(0.0 < value < math.inf for value in declared):
+                    yield path, declared
+
+    def quarantine(self) -> str:
+        """Rename a rejected file, so that the next save does not overwrite it. Return a description for the user.
+
+        A file of a later format is valid. It gets a separate name, so that the later version can use it after a
+        re-upgrade. The user must rename it back: it is not loaded automatically, because this version meanwhile writes
+        newer files, although these may contain less learning.
+        """
+        quarantined = self.path.with_name(f"{self._name}.refused.npz")
+        if self._is_later:
+            paths = [self.path.with_name(f"{self._name}.later-{n}.npz") for n in range(1, MAX_LATER_FILES + 1)]
+            unused_paths = (path for path in paths if not path.exists())
+            quarantined = next(unused_paths, paths[-1])  # without an unused name the last file is overwritten
+        outcome = set_aside(self.path, quarantined)
+        if not self._is_later or self.path.exists():
+            return outcome
+        command = shlex.join(["mv", str(quarantined.resolve()), str(self.path.resolve())])
+        return f"{outcome}; once the version that wrote it is installed again, stop the service and `{command}`"
+
+    def _validate(self, file: Mapping[str, NDArray[Any]]) -> PackState:
+        """Return the content of a file.
+
+        Raises:
+            RejectedFileError: The file has another format or identity, or is too old.
+        """
+        version = int(file["format"])
+        self._is_later = version > FORMAT
+        if version not in (FORMER_FORMAT, FORMAT):
+            raise RejectedFileError(f"format {version}, this version reads {FORMAT}")
+        if str(file["identity"]) != self._identity:
+            raise RejectedFileError("it belongs to another pack or cell")
+        state = dict(fields(file["state"]))
+        saved = BootTimestamp(
+            float(file["wall_s"]), bool(file["synchronised"]), float(file["boot_s"]), str(file["boot"])
+        )
+        if version == FORMAT and (changes := self._changes.load(str(file["token"]), file["state"].dtype)):
+            state, saved = state | changes.state, changes.saved
+        gap_s = self._now().since(saved)
+        if self._longest_days is not None and self._longest_days * DAY_S < gap_s < math.inf:
+            days = f"{gap_s / DAY_S:.1f} days old"
+            raise RejectedFileError(f"it is {days}, state.longest_days is {self._longest_days:g}")
+        if str(file["observer"]) != self._observer:
+            state = without_observer(state)
+        return PackState(
+            state, _with_prefix(file, _CURVES), _with_prefix(file, _CELLS), gap_s=gap_s, declared=self._declared
+        )
+
+    def _remove_oldest(self) -> None:
+        """Remove the pack's oldest files beyond ``MAX_FILES``, because each configured cell leaves a file."""
+        others = self._other_paths()
+        others.sort(key=lambda path: path.lstat().st_mtime, reverse=True)
+        for path in others[MAX_FILES - 1 :]:
+            path.unlink(missing_ok=True)
+            for suffix in (HISTORY_SUFFIX, LOAD_SUFFIX, *CHANGES_SUFFIXES):
+                path.with_suffix(suffix).unlink(missing_ok=True)
+
+    def _other_paths(self) -> list[Path]:
+        """Return the pack's checkpoints with other identities."""
+        ours = re.compile(rf"{re.escape(self._name)}-[0-9a-f]{{8}}\.npz")
+        folder = self.path.parent.iterdir() if self.path.parent.is_dir() else ()
+        return [path for path in folder if ours.fullmatch(path.name) and path != self.path]
+
+
+def _with_prefix(file: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays whose names begin with ``prefix``, without it."""
+    return {name.removeprefix(prefix): v for name, v in file.items() if name.startswith(prefix)}
+
 
 log = structlog.get_logger(__name__)
 

@@ -4,8 +4,7 @@ import re
 
 import numpy as np
 
-from bms_estimator.conversion.circuit import OcvTable, ladder_table, ocv_table
-from bms_estimator.conversion.template import fill_template, value_lines
+from bms_estimator.conversion.circuit import OcvTable, fill_template, ladder_table, ocv_table, value_lines
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import (

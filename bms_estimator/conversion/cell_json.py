@@ -1,4 +1,14 @@
-"""Cell as JSON with a published schema, docs/reference/cell.schema.json."""
+"""Cell as JSON with a published schema, docs/reference/cell.schema.json.
+
+Parameters of PyBaMM's Thevenin model as the text of a Python module. PyBOP uses the same parameters.
+
+A cell with an RC ladder becomes a series resistance and six RC pairs. The voltage of a ladder's RC pair is x R(SOC), where x
+is the filtered current, so that the voltage follows a change of R at once. The voltage v of PyBaMM's RC pair relaxes towards
+I R. Both voltages are equal if PyBaMM gets the effective resistance R / (1 + tau I R'(SOC) / (3600 Q R)), which follows from
+dv/dt = R dx/dt + x R'(SOC) dSOC/dt.
+
+A cell without an RC ladder becomes R_s and the two RC pairs (2.5)-(2.9) of the thesis.
+"""
 
 import json
 from typing import Any, Literal
@@ -6,7 +16,11 @@ from typing import Any, Literal
 from pydantic import Field
 from pydantic.json_schema import GenerateJsonSchema
 
+from bms_estimator.conversion.circuit import fill_template, ladder_table, ocv_table, value_lines
+from bms_estimator.kernels.cell_model.open_loop import MIN_CAPACITANCE
 from bms_estimator.kernels.cell_model.rc_ladder import (
+    BRANCHES,
+    GAS_J,
     HYSTERESIS_J,
     REFERENCE_C,
     STRONG_J,
@@ -14,8 +28,77 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     WEAK_J,
 )
 from bms_estimator.kernels.kalman_filter.records import Noise
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_file import DIGITS
 from bms_estimator.model.config_file import Strict
+from bms_estimator.version import __version__
+
+PAIR = """\
+        "R{k} [Ohm]": lambda temperature_c, current_a, soc: pair_ohm({k}, temperature_c, current_a, soc),
+        "C{k} [F]": lambda temperature_c, current_a, soc: pair_farad({k}, temperature_c, current_a, soc),
+        "Element-{k} initial overpotential [V]": 0,"""
+"""Values of RC pair k."""
+
+
+def pybamm_module(cell: CellModel) -> str:
+    """Return the text of a Python module whose ``get_parameter_values`` returns PyBaMM's parameters of the cell."""
+    ocv, ratings = ocv_table(cell), cell.cell
+    pair_count = 2 if cell.ladder is None else BRANCHES
+    return fill_template(
+        "thevenin.py.txt",
+        name=_docstring_text(ratings.name),
+        description=_docstring_text(ratings.description),
+        version=__version__,
+        pair_count=pair_count,
+        capacity_ah=ratings.capacity_ah,
+        ocv_soc=_array(ocv.soc),
+        ocv_v=_array(ocv.ocv_v),
+        per_kelvin_v=_array(ocv.per_kelvin_v),
+        elements=_two_pairs(cell) if cell.ladder is None else _ladder(cell),
+        voltage_min_v=ratings.voltage_min_v,
+        voltage_max_v=ratings.voltage_max_v,
+        pair_values="\n".join(PAIR.format(k=k) for k in range(1, pair_count + 1)),
+    )
+
+
+def _ladder(cell: CellModel) -> str:
+    table = ladder_table(cell)
+    return fill_template(
+        "ladder.py.txt",
+        soc=_array(table.soc),
+        weak_ohm=_matrix(table.weak_ohm),
+        strong_ohm=_matrix(table.strong_ohm),
+        tau_s=TAU_S,
+        weak_j=WEAK_J,
+        strong_j=STRONG_J,
+        gas_j=GAS_J,
+    )
+
+
+def _two_pairs(cell: CellModel) -> str:
+    return fill_template("two_pairs.py.txt", a=[None, *cell.a[1:16].tolist()], min_capacitance=MIN_CAPACITANCE)
+
+
+def _docstring_text(text: str) -> str:
+    """Return a text without quotes and backslashes, because a foreign cell file must not end the docstring."""
+    return " ".join(text.replace("\\", "/").replace('"', "'").split())
+
+
+def _array(values: Floats) -> str:
+    """Return a numpy array as Python text; the zeros of a missing column are not listed."""
+    if not values.any():
+        return f"np.zeros({values.size})"
+    return f"np.array([\n{value_lines(_numbers(values), 4)},\n])"
+
+
+def _matrix(rows: Floats) -> str:
+    return "np.array([\n    " + ",\n    ".join(f"[{', '.join(_numbers(row))}]" for row in rows) + ",\n])"
+
+
+def _numbers(values: Floats) -> list[str]:
+    """Return numbers as Python text, rounded as in a cell file."""
+    return [repr(float(f"{x:.{DIGITS}g}")) for x in values.tolist()]
 
 
 class ModelConstants(Strict):

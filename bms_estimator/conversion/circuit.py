@@ -1,6 +1,9 @@
-"""Equivalent circuit of a cell as tables: open-circuit voltage and RC ladder."""
+"""Equivalent circuit of a cell as tables: open-circuit voltage and RC ladder; and the templates of exported files."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from string import Template
 
 import numpy as np
 
@@ -9,6 +12,22 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import weak_share
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, TableOcv
+
+TEMPLATES = Path(__file__).with_name("templates")
+LINE_VALUES = 6
+"""Number of values on a line of a table."""
+
+
+def fill_template(template: str, **values: object) -> str:
+    """Return the text of a template with values in place of its placeholders, such as ``${name}``."""
+    return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(values)
+
+
+def value_lines(texts: Sequence[str], indent: int) -> str:
+    """Return values as indented lines of at most ``LINE_VALUES``, separated by commas."""
+    lines = (", ".join(texts[i : i + LINE_VALUES]) for i in range(0, len(texts), LINE_VALUES))
+    return ",\n".join(" " * indent + line for line in lines)
+
 
 MIN_OHM = 1e-9
 """Minimum of the exported resistances [ohm], because the capacitance of an RC pair without resistance is infinite."""

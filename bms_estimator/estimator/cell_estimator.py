@@ -14,7 +14,6 @@ from bms_estimator.kernels.cells.cell_filter import BIAS_V
 from bms_estimator.kernels.cells.records import BANK, CAPACITY, CELL, LEAK, RESISTANCE, SOC, STATES, ReadingFault
 from bms_estimator.kernels.cells.step import run_cells
 from bms_estimator.model.arrays import Floats, Records
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
@@ -88,8 +87,8 @@ class CellEstimator:
     def __init__(self, estimator: Estimator) -> None:
         self._estimator, cell = estimator, estimator.cell
         self._series = cell.cell.series_count
-        self._enabled = estimator.identifying and isinstance(cell, CellModel) and self._series >= MIN_CELLS
-        self._balancing_v = balancing_voltage_v(cell) if isinstance(cell, CellModel) else math.inf
+        self._enabled = estimator.identifying and self._series >= MIN_CELLS
+        self._balancing_v = balancing_voltage_v(cell)
         self._deviations: CellDeviations | None = None
         self._deviations_window = 0  # number of the window of ``_deviations``
         self._start(0)

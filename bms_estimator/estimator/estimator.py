@@ -20,7 +20,7 @@ from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.columns import Columns
-from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
@@ -171,8 +171,8 @@ class Estimator:
         Raises:
             ValueError: ``soc`` is outside 0..1, or the estimator is of a fuel cell, which has no SOC.
         """
-        if isinstance(self.cell, FuelCellModel):
-            raise ValueError("a fuel cell has no SOC")  # noqa: TRY004 - the argument has the right type
+        if self.cell.capacity_ah is None:
+            raise ValueError("a fuel cell has no SOC")
         if not 0.0 <= soc <= 1.0:
             raise ValueError(f"SOC {soc} is outside 0..1")
         self.state["soc"] = self.state["soc_coulomb"] = soc

@@ -1,27 +1,74 @@
-"""Conversion of typed settings to the settings records of the kernels.
+"""Conversion of typed settings, and of a fuel cell's file, to the settings records of the kernels.
 
 Numbers in parentheses are equations of the thesis.
 """
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.anchor_settings import anchor_settings
 from bms_estimator.estimator.filter_settings import filter_settings, max_ohm, unmeasured_s
-from bms_estimator.estimator.fuel_cell_settings import fuel_cell_settings
-from bms_estimator.estimator.learning_settings import learning_settings
+from bms_estimator.estimator.learning_settings import LEAK_S, RATE_HZ, REACH, learning_settings
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, PARAMETERS, emf, r_s, r_tl, r_ts
 from bms_estimator.kernels.cell_model.current_interpolation import PERIODS
+from bms_estimator.kernels.cell_model.fuel_cell import NAMES
+from bms_estimator.kernels.observer.learning_model import Model
+from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, series_coefficients
 from bms_estimator.kernels.observer.nussbaum import Nussbaum
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
-from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.monotone_cubic import MonotoneCubic
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import SCHEME_2_EPSILON, SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
 from bms_estimator.settings.sampling import EXACT, Sampling
+
+MEMORY_S = 60.0
+"""Time constant with which the learning law of a stack discounts data [s]. Water and gas supply change within a minute."""
+SETTLE_S = 5.0
+"""Settling time of double layer and oxygen supply after an unmeasured gap [s]."""
+MAX_FACTORS = {
+    "r_ohm": 4.0,
+    "tafel_slope_v": 1.5,
+    "activation_v": 1.3,
+    "c_dl_farad": 4.0,
+    "concentration_v": 4.0,
+    "limiting_current_a": 2.0,
+    "internal_current_a": 4.0,
+}
+"""Maximum ratio of each parameter to its value in the file. The minimum ratio is the inverse. A ratio of 1.3 of the
+activation loss at 1 A corresponds to about 8 of the exchange current."""
+
+
+def fuel_cell_settings(cell: FuelCellModel, observer_record: np.void) -> NDArray[np.void]:
+    """Return the learning law's settings record.
+
+    The output error is not injected as a voltage offset, because a constant voltage error indicates the exchange current.
+
+    Args:
+        cell: The stack as one two-terminal object.
+        observer_record: Record of dtype ``OBSERVER_SETTINGS``.
+
+    Returns:
+        Shape (1,), dtype ``LEARNING_SETTINGS``.
+    """
+    record = np.zeros(1, dtype=LEARNING_SETTINGS)
+    q, n = record[0], len(NAMES)
+    q["enabled"], q["model"], q["count"], q["file"] = 1, Model.FUEL_CELL, n, cell.a
+    q["upper"][:n] = [math.log(MAX_FACTORS[name]) for name in NAMES]
+    q["lower"] = -q["upper"]
+    q["told_v"], q["cells"] = observer_record["epsilon_v"], cell.cell.series_count
+    q["leak_v2s"][:n] = LEAK_S * float(q["told_v"]) ** 2 / q["upper"][:n] ** 2
+    q["memory_s"], q["offset_s"], q["settle_s"] = MEMORY_S, math.inf, SETTLE_S
+    q["rate"], q["reach"] = RATE_HZ, REACH
+    q["soc_floor"] = -math.inf  # a fuel cell has no SOC
+    return record
+
 
 DEAD_ZONE_STEPS = 2.0
 """Default dead zone in steps of the voltage converter: half a step of rounding, half a step of noise, and a safety factor

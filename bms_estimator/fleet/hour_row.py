@@ -86,16 +86,31 @@ class Hour(Payload):
     suspects: int = Field(description="bits of model.input_faults.InputFault")
     weakest_cell: int | None = Field(
         default=None,
-        description="number of the series cell with the lowest SOC, from 1; null before an estimate of the single cells, as are the "
-        "following six",
+        description="number of the series cell whose SOC is most significantly below the mean (lowest deviation plus three std), from 1; "
+        "null before an estimate of the single cells, as are the following fields up to self_discharge_std_a",
     )
     weakest_cell_soc_deviation: float | None = Field(
         default=None, description="SOC of weakest_cell less the mean SOC of the cells"
     )
+    weakest_cell_soc_deviation_std: float | None = Field(default=None)
     weakest_cell_resistance_ratio: float | None = Field(
         default=None, description="resistance of weakest_cell relative to the median of the cells"
     )
     cell_soc_spread: float | None = Field(default=None, description="highest less lowest SOC of the cells")
+    smallest_cell: int | None = Field(
+        default=None, description="number of the series cell with the smallest capacity, from 1"
+    )
+    smallest_cell_capacity_ratio: float | None = Field(
+        default=None, description="capacity of smallest_cell relative to the median of the cells"
+    )
+    resistive_cell: int | None = Field(
+        default=None,
+        description="number of the series cell with the highest resistance ratio less three std, from 1",
+    )
+    resistive_cell_ratio: float | None = Field(
+        default=None, description="resistance of resistive_cell relative to the median of the cells"
+    )
+    resistive_cell_ratio_std: float | None = Field(default=None)
     self_discharge_cell: int | None = Field(
         default=None, description="number of the series cell with the most significant self-discharge, from 1"
     )

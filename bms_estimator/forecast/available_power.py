@@ -11,7 +11,7 @@ from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.kernels.kalman_filter.records import SOC
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 
@@ -73,10 +73,7 @@ def cell_power_limits(cell: PackModel) -> PowerLimits:
     Args:
         cell: Model of the whole pack.
     """
-    max_a = cell.cell.current_max_a
-    if not isinstance(cell, CellModel):
-        return PowerLimits(max_a, max_a)
-    one_c_a = cell.cell.capacity_ah
+    max_a, one_c_a = cell.cell.current_max_a, cell.one_c_a
     return PowerLimits(
         max_a,
         max_a,

@@ -14,8 +14,7 @@ from bms_estimator.forecast.available_power import PowerLimits, PresentPower, ce
 from bms_estimator.forecast.capability import projected_pack, write_capability
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
-from bms_estimator.forecast.load_history import LoadHistory
-from bms_estimator.forecast.load_spread import load_spread
+from bms_estimator.forecast.load_history import LoadHistory, load_spread
 from bms_estimator.forecast.past_minutes import MINUTE_S, PastMinutes
 from bms_estimator.forecast.projection import (
     Projection,
@@ -26,7 +25,6 @@ from bms_estimator.forecast.projection import (
     time_quantiles,
 )
 from bms_estimator.model.arrays import Floats, Records
-from bms_estimator.model.fuel_cell import FuelCellModel
 
 MIN_INTERVAL_S = 10.0
 """Minimum interval between two forecasts, on the clock of the samples [s]. It limits the CPU time near the cut-off."""
@@ -172,10 +170,8 @@ class Forecaster:
 
     def _missing_state(self) -> str | None:
         """Return the reason why the pack cannot be projected; None if it can."""
-        if isinstance(self.estimator.cell, FuelCellModel):
-            return "a fuel cell has no state of charge"
         if not self.estimator.identifying:
-            return "the identifier is switched off"
+            return self.estimator.cell.no_forecast_reason
         if not self.estimator.record[0]["filter"]["started"]:
             return "no sample has been processed yet"
         return None

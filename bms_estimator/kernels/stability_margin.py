@@ -46,7 +46,7 @@ def has_valid_parameters(s: Record, p: Record, e: int) -> bool:
     if fit.bins[e] < MIN_BINS or not math.isfinite(s.unlearned_s[e]):
         return False
     for i in range(3 * e + 1, 3 * e + 4):
-        std = math.hypot(fit.std[i], fit.a[i] - o.a[i])
+        std = math.sqrt(fit.std[i] ** 2 + (fit.a[i] - o.a[i]) ** 2)
         if o.target[i] == p.observer.target[i] or not std < VALID_FIT_STD * abs(o.a[i]):
             return False
     return True

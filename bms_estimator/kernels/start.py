@@ -54,7 +54,7 @@ def restart_filter(s: Record, p: Record, gap_s: float, current_a: float, voltage
     f.current_a, f.step.phase = current_a, UNHELD
     update_arrhenius_factors(f)
     if gap_s < p.filter.unmeasured_s:  # too short for a charge or an exchange of the pack
-        soc_std = math.hypot(f.soc_std, f.window.unknown_as / p.filter.capacity_as)
+        soc_std = math.sqrt(f.soc_std**2 + (f.window.unknown_as / p.filter.capacity_as) ** 2)
         prepare_transition(f, p.filter)
         predict(f, p.filter, f.best)
         spawn_hypotheses(f, p.filter, f.soc, min(soc_std, MAX_SOC_STD_AFTER_GAP))

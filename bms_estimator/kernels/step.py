@@ -75,9 +75,9 @@ def validate_sample(s: Record, p: Record, time_s: float, current_a: float, volta
 
 
 @njit(cache=True)
-def step(
-    state: Records,
-    settings: Records,
+def process_sample(
+    s: Record,
+    p: Record,
     time_s: float,
     current_a: float,
     voltage_v: float,
@@ -97,8 +97,8 @@ def step(
     interpolated. Until then only the last of several such voltages is stored.
 
     Args:
-        state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
-        settings: Shape (1,), dtype ESTIMATOR_SETTINGS.
+        s: Record of ESTIMATOR_STATE; updated in place.
+        p: Record of ESTIMATOR_SETTINGS.
         time_s: Time stamp [s].
         current_a: Current [A], positive on discharge.
         voltage_v: Terminal voltage [V].
@@ -108,58 +108,58 @@ def step(
     Returns:
         A ``SampleOutcome``.
     """
-    s, p = state[0].observer, settings[0].observer
-    outcome = validate_sample(s, p, time_s, current_a, voltage_v, status)
+    o = s.observer
+    outcome = validate_sample(o, p.observer, time_s, current_a, voltage_v, status)
     if outcome != _ACCEPTED:
         return outcome
-    if is_doubtful(state[0], p, time_s - s.time_s, current_a, voltage_v, status):
+    if is_doubtful(s, p.observer, time_s - o.time_s, current_a, voltage_v, status):
         return _CONTRADICTED
-    s.samples += 1
-    if not s.started:
-        set_reference(state[0].current_check, current_a, voltage_v, 0)
-        initialize(s, p, time_s, current_a, voltage_v)
-        initialize_state(state[0], settings[0], current_a, voltage_v, temperature_c)
+    o.samples += 1
+    if not o.started:
+        set_reference(s.current_check, current_a, voltage_v, 0)
+        initialize(o, p.observer, time_s, current_a, voltage_v)
+        initialize_state(s, p, current_a, voltage_v, temperature_c)
         return outcome
-    store_temperature(state[0].learning, temperature_c)
-    dt_s = time_s - s.time_s
-    pending = state[0].pending
+    store_temperature(s.learning, temperature_c)
+    dt_s = time_s - o.time_s
+    pending = s.pending
     if status & _CURRENT_HELD and dt_s > 0.0:
         if not status & _VOLTAGE_HELD:
             pending.age_s, pending.voltage_v = dt_s, voltage_v
         return outcome
-    dt_s -= advance_to_waiting(state, settings, dt_s, current_a, voltage_v, temperature_c)
-    set_reference(state[0].current_check, current_a, voltage_v, status)
+    dt_s -= advance_to_waiting(s, p, dt_s, current_a, voltage_v, temperature_c)
+    set_reference(s.current_check, current_a, voltage_v, status)
     pending_s, pending.age_s = pending.age_s, 0.0
-    s.time_s = time_s
+    o.time_s = time_s
     new_clock = dt_s == -math.inf  # ``Estimator.resume`` has set the time of the last sample to infinity
     if new_clock:
-        dt_s = state[0].unseen_s
-        settle_s = settings[0].learning.settle_s  # RC voltages are unknown, because the load in the gap is unknown
-        state[0].learning.settle_s = state[0].series_resistance.settle_s = settle_s
+        dt_s = s.unseen_s
+        settle_s = p.learning.settle_s  # RC voltages are unknown, because the load in the gap is unknown
+        s.learning.settle_s = s.series_resistance.settle_s = settle_s
     if not 0.0 <= dt_s < math.inf:  # the clock was set back, or the duration of the gap is unknown
-        s.current_a = state[0].filter.current_a = current_a
-        state[0].filter.step.phase = UNHELD
+        o.current_a = s.filter.current_a = current_a
+        s.filter.step.phase = UNHELD
         if new_clock:
-            restart_after_unknown_gap(state[0], settings[0], current_a, voltage_v, temperature_c)
+            restart_after_unknown_gap(s, p, current_a, voltage_v, temperature_c)
         else:
-            s.time_steps_back += 1
+            o.time_steps_back += 1
         return outcome
-    gap = new_clock or is_gap(s, p, dt_s)
+    gap = new_clock or is_gap(o, p.observer, dt_s)
     measured_v = math.nan if status & _VOLTAGE_HELD else voltage_v
     if 0.0 < pending_s < dt_s and not gap:
-        change_a = current_a - s.current_a
-        pending_a = s.current_a + pending_s / dt_s * change_a
-        widen_by_interpolation(state[0].filter.window, change_a, pending_s, dt_s)
-        advance(state, settings, pending_s, False, pending_a, pending.voltage_v, pending.voltage_v, temperature_c)
+        change_a = current_a - o.current_a
+        pending_a = o.current_a + pending_s / dt_s * change_a
+        widen_by_interpolation(s.filter.window, change_a, pending_s, dt_s)
+        advance(s, p, pending_s, False, pending_a, pending.voltage_v, pending.voltage_v, temperature_c)
         dt_s -= pending_s
-    advance(state, settings, dt_s, gap, current_a, measured_v, voltage_v, temperature_c)
+    advance(s, p, dt_s, gap, current_a, measured_v, voltage_v, temperature_c)
     return outcome
 
 
 @njit(cache=True)
 def advance(
-    state: Records,
-    settings: Records,
+    s: Record,
+    p: Record,
     dt_s: float,
     gap: bool,
     current_a: float,
@@ -170,8 +170,8 @@ def advance(
     """Advance all parts of the estimator by ``dt_s``.
 
     Args:
-        state: Shape (1,), dtype ESTIMATOR_STATE; updated in place.
-        settings: Shape (1,), dtype ESTIMATOR_SETTINGS.
+        s: Record of ESTIMATOR_STATE; updated in place.
+        p: Record of ESTIMATOR_SETTINGS.
         dt_s: Time step [s].
         gap: True if samples are missing in the step.
         current_a: Current at the end of the step [A].
@@ -179,38 +179,52 @@ def advance(
         voltage_v: Last measured voltage [V].
         temperature_c: Temperature of the cell [C]; NaN without a sensor.
     """
-    s, p = state[0].observer, settings[0].observer
-    previous_a, previous_soc = s.current_a, s.soc
-    count_charge(s, p, dt_s, current_a)
-    s.voltage_age_s += dt_s
-    if settings[0].identify:
-        identifier_step(state[0], settings[0], dt_s, gap, current_a, measured_v, temperature_c)
+    o = s.observer
+    previous_a, previous_soc = o.current_a, o.soc
+    count_charge(o, p.observer, dt_s, current_a)
+    o.voltage_age_s += dt_s
+    if p.identify:
+        identifier_step(s, p, dt_s, gap, current_a, measured_v, temperature_c)
     else:
-        s.soc = s.soc_coulomb
-    if settings[0].learning.enabled:
-        learning_step(state[0], settings[0], dt_s, previous_a, measured_v)
+        o.soc = o.soc_coulomb
+    if p.learning.enabled:
+        learning_step(s, p, dt_s, previous_a, measured_v)
     else:
-        observer_step(s, p, dt_s, voltage_v)
-    if settings[0].series_resistance:
-        series_resistance_step(state[0], settings[0], dt_s, previous_a, previous_soc, measured_v)
+        observer_step(o, p.observer, dt_s, voltage_v)
+    if p.series_resistance:
+        series_resistance_step(s, p, dt_s, previous_a, previous_soc, measured_v)
     if math.isfinite(measured_v):
-        s.voltage_age_s = 0.0
+        o.voltage_age_s = 0.0
 
 
 @njit(cache=True)
 def advance_to_waiting(
-    state: Records, settings: Records, dt_s: float, current_a: float, voltage_v: float, temperature_c: float
+    s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float, temperature_c: float
 ) -> float:
     """Advance to the samples that waited, if this sample confirms them. Return the time step to them [s]; 0 without any.
 
     Their voltages are not used, because they did not belong to their currents. Parameters are those of ``advance``.
     """
-    if not accept_waiting(state[0], settings[0].observer, dt_s, current_a, voltage_v):
+    if not accept_waiting(s, p.observer, dt_s, current_a, voltage_v):
         return 0.0
-    d = state[0].current_check
-    state[0].pending.age_s = 0.0
-    advance(state, settings, d.age_s, False, d.current_a, math.nan, d.voltage_v, temperature_c)
+    d = s.current_check
+    s.pending.age_s = 0.0
+    advance(s, p, d.age_s, False, d.current_a, math.nan, d.voltage_v, temperature_c)
     return float(d.age_s)
+
+
+@njit(cache=True)
+def step(
+    state: Records,
+    settings: Records,
+    time_s: float,
+    current_a: float,
+    voltage_v: float,
+    status: int,
+    temperature_c: float,
+) -> int:
+    """Process one sample and return its ``SampleOutcome``: ``process_sample`` for the arrays of ``run``."""
+    return process_sample(state[0], settings[0], time_s, current_a, voltage_v, status, temperature_c)
 
 
 @njit(cache=True)
@@ -241,15 +255,16 @@ def run(state: Records, settings: Records, samples: Records, trace: Records) -> 
     Returns:
         Number of samples processed, and number of rows written to ``trace``.
     """
-    rows = 0
+    s, p, rows = state[0], settings[0], 0
     for j in range(samples.shape[0]):
         x = samples[j]
-        if step(state, settings, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
-            write_observer_trace(trace[rows], state[0].observer, settings[0], x)
-            write_filter_trace(trace[rows], state[0], settings[0])
-            write_margin(trace[rows], state[0], settings[0])
+        if process_sample(s, p, x.time_s, x.current_a, x.voltage_v, x.status, x.temperature_c) == _ACCEPTED:
+            row = trace[rows]
+            write_observer_trace(row, s.observer, p, x)
+            write_filter_trace(row, s, p)
+            write_margin(row, s, p)
             rows += 1
-            if needs_caller(state[0].history):
+            if needs_caller(s.history):
                 return j + 1, rows
     return samples.shape[0], rows
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from enum import StrEnum
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.suggestion import suggestion
+from bms_estimator.model.one_of import suggestion
 
 ELEMENTS = {
     "r_ts": (1, "amplitude_ohm", "offset_ohm"),  # (2.5)
@@ -36,6 +36,9 @@ DEFAULT_RATE = 100.0
 """Default rate lambda_x + lambda_y of (3.18), that of most parameters of the shipped cell ``chen_mora`` [1/s]."""
 CAPACITANCE_NUMBERS = (2, 3)
 """Positions of C_ts and C_tl in ``ELEMENTS``."""
+MAX_C_RATE = 100.0
+"""Highest possible current as a C-rate [1/h]. Power cells give 50 C. A higher current is a short circuit, which
+the fuse or the cell ends within a second."""
 
 
 class Resistance(Strict):
@@ -241,6 +244,8 @@ class CellModel(Strict):
     adaptation: dict[str, Bounds] = Field(default_factory=dict, description="bounds by parameter, keys a1 to a15")
     # repr=False: identities of checkpoints are hashes of the repr, and do not depend on the origin of the values
     fit: Fit | None = Field(default=None, repr=False, description="captures that the values were fitted to")
+    no_forecast_reason: ClassVar[str] = "the identifier is switched off"
+    """Reason why the estimator of this model makes no forecasts, if it makes none."""
 
     @model_validator(mode="after")
     def _known_parameters(self) -> Self:
@@ -249,6 +254,31 @@ class CellModel(Strict):
             if name not in known:
                 raise ValueError(f"adaptation.{name}: no such parameter; a1 to a15 adapt")
         return self
+
+    @property
+    def capacity_ah(self) -> float:
+        """Rated capacity [Ah]."""
+        return self.cell.capacity_ah
+
+    @property
+    def capacity_text(self) -> str:
+        """Rated capacity with its unit."""
+        return f"{self.capacity_ah:g} Ah"
+
+    @property
+    def one_c_a(self) -> float:
+        """Current of one C [A]."""
+        return self.capacity_ah
+
+    @property
+    def possible_a(self) -> float:
+        """Highest possible current [A]."""
+        return MAX_C_RATE * self.capacity_ah
+
+    def state_basis(self, current_sign: str) -> tuple[float | str, ...]:
+        """Return all numbers on which the meaning of a saved state depends."""
+        curve = self.ocv.a if isinstance(self.ocv, ChenMoraOcv) else (*self.ocv.soc, *self.ocv.ocv_v)
+        return (self.cell.series_count, self.capacity_ah, current_sign, *curve)
 
     @property
     def a(self) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ import tomlkit
 
 from bms_estimator.model.cell import ELEMENTS
 from bms_estimator.model.config_file import write_text
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 
 EQUATIONS = {"r_ts": "(2.5)", "r_tl": "(2.6)", "c_ts": "(2.7)", "c_tl": "(2.8)", "r_s": "(2.9)"}
 """Equation of the thesis for each section, for the section's comment."""

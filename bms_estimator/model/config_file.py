@@ -16,7 +16,7 @@ from pydantic import (
 from pydantic_core.core_schema import CoreSchema, no_info_before_validator_function
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.suggestion import suggestion
+from bms_estimator.model.one_of import suggestion
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]

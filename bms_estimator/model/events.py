@@ -6,11 +6,9 @@ from typing import Literal, NamedTuple
 from pydantic import Field
 
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads.alarm import Alarm
-from bms_estimator.model.payloads.health import AnchorReport, Health
-from bms_estimator.model.payloads.pack_model import FitReport
+from bms_estimator.model.payloads.health import AnchorReport, FitReport, Health
 from bms_estimator.model.payloads.payload import Payload
-from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 
 MIN_UNSEEN_S = 1.0
 """Minimum duration of a gap that causes an event [s]. Shorter gaps only count in ``health``."""

@@ -7,20 +7,13 @@ several such stacks. A fuel cell has no capacity and no SOC.
 import math
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from bms_estimator.model.cell import (
-    CellModel,
-    Rated,
-    cell_file_path,
-    is_fuel_cell,
-    load_cell,
-    shipped_fuel_cells,
-)
+from bms_estimator.model.cell import Rated, cell_file_path, shipped_fuel_cells
 from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml
 from bms_estimator.model.errors import UserError
 
@@ -36,6 +29,8 @@ Parameter = Literal[
 """Identified parameters of a stack, in the order of ``kernels.cell_model.fuel_cell.NAMES``."""
 CONSTANTS = 16
 """Length of an array with the kernels' constants."""
+MAX_CURRENT_RATIO = 10.0
+"""Highest possible current of a fuel cell in multiples of its maximum current. Its limiting current density is lower."""
 
 
 class FuelCell(Strict):
@@ -85,6 +80,32 @@ class FuelCellModel(Strict):
         constants = np.zeros(CONSTANTS)
         constants[1:12] = *losses, *currents, *conditions
         return constants
+
+    no_forecast_reason: ClassVar[str] = "a fuel cell has no state of charge"
+    """Reason why the estimator of this model makes no forecasts."""
+
+    @property
+    def capacity_ah(self) -> None:
+        """Rated capacity: a fuel cell has none."""
+
+    @property
+    def capacity_text(self) -> str:
+        """Kind of the model, in place of a capacity."""
+        return "fuel cell"
+
+    @property
+    def one_c_a(self) -> float:
+        """Reference of C-rates, the maximum current, because a fuel cell has no capacity [A]."""
+        return self.cell.current_max_a
+
+    @property
+    def possible_a(self) -> float:
+        """Highest possible current [A]."""
+        return MAX_CURRENT_RATIO * self.cell.current_max_a
+
+    def state_basis(self, current_sign: str) -> tuple[float | str, ...]:
+        """Return all numbers on which the meaning of a saved state depends: learned values are relative to all parameters."""
+        return (*self.a, current_sign)
 
     @property
     def activation_v(self) -> float:
@@ -139,10 +160,6 @@ class FuelCellModel(Strict):
         )
 
 
-PackModel = CellModel | FuelCellModel
-"""Model of a pack of batteries or of fuel cell stacks."""
-
-
 def load_fuel_cell(name_or_path: str | Path) -> FuelCellModel:
     """Load a shipped fuel cell by name, or a fuel cell file by path.
 
@@ -154,16 +171,3 @@ def load_fuel_cell(name_or_path: str | Path) -> FuelCellModel:
         return read_toml(cell_file_path(text), FuelCellModel)
     with resources.as_file(resources.files("bms_estimator.model") / f"cells/fuel_cell/{text}.toml") as path:
         return read_toml(path, FuelCellModel)
-
-
-def load_any(name_or_path: str | Path, capacity_ah: float | None = None) -> PackModel:
-    """Load a battery cell (``load_cell``) or a fuel cell (``load_fuel_cell``).
-
-    Raises:
-        UserError: No such cell or file, an invalid value, or a capacity for a fuel cell.
-    """
-    if not is_fuel_cell(name_or_path):
-        return load_cell(name_or_path, capacity_ah)
-    if capacity_ah is not None:
-        raise UserError(f"{name_or_path} is a fuel cell, which has no capacity: leave out capacity_ah")
-    return load_fuel_cell(name_or_path)

@@ -8,7 +8,7 @@ import structlog
 from bms_estimator.mqtt.connection import PublishRejection
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.message import Message
-from bms_estimator.process.backoff import Backoff
+from bms_estimator.process.tasks import Backoff
 
 log = structlog.get_logger(__name__)
 

@@ -8,7 +8,7 @@ from bms_estimator.mqtt.connection import Connection
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.denied_topics import DeniedTopics
 from bms_estimator.mqtt.message import QueuedMessage
-from bms_estimator.process.backoff import Backoff
+from bms_estimator.process.tasks import Backoff
 
 WINDOW = 16
 """Maximum number of unacknowledged queued messages. Brokers and paho allow 20 in flight; four remain for live topics."""

@@ -9,7 +9,7 @@ import structlog
 from bms_estimator.mqtt.broker_config import Broker
 from bms_estimator.mqtt.connection import BrokerConnectionError, Connect, Connection, ConnectOptions
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.process.backoff import FIRST_DELAY_S, MAX_DELAY_S, Backoff
+from bms_estimator.process.tasks import FIRST_DELAY_S, MAX_DELAY_S, Backoff
 
 MIN_CONNECTION_S = 10.0
 """Minimum duration of a connection that counts as successful [s]; a shorter one is followed by the backoff delay."""

@@ -15,7 +15,7 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
 from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics, TopicCache
-from bms_estimator.process.backoff import FIRST_DELAY_S
+from bms_estimator.process.tasks import FIRST_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
 
 MAX_WAITING = 2000

@@ -19,7 +19,7 @@ from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.saved_load import restore_load
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.pack.declared_capacity import with_capacity
 from bms_estimator.pack.state import (

@@ -6,8 +6,8 @@ from collections.abc import Callable, Collection, Sequence
 from typing import Self
 
 from bms_estimator.model.clock import since_boot
-from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.health import HookHealth
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.service.hook import Hook, counts_as_raised
 from bms_estimator.service.hook_check import require_output
 from bms_estimator.service.job_hook import CommandHook, PublishHook, PublishRaw

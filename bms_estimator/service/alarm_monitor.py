@@ -18,9 +18,9 @@ from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.faulty_fraction import UNUSABLE_KINDS, SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.sample_intervals import UNUSABLE_KINDS, SampleCounts
 from bms_estimator.telemetry.alarms.sensor_faults import BoardResets
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions

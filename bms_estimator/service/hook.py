@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import structlog
 
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.alarms import AlarmHook
 
 ERROR_PAUSE_S = 0.5

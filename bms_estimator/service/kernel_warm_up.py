@@ -25,7 +25,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
+from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 
 WARM_UP_S = 330
 """Duration of the load with which the kernels of a forecast are called [s], longer than ``forecaster.MIN_LOAD_S``."""

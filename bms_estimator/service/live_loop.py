@@ -1,10 +1,13 @@
-"""Live loop that passes samples from the source to the estimator, and estimates to the sinks."""
+"""Live loop that passes samples from the source to the estimator, and estimates to the sinks.
+
+A thread fits the pack's model, so that a fit delays neither samples nor messages.
+"""
 
 import asyncio
 import contextlib
 import math
 from collections.abc import Awaitable, Callable, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 
 import structlog
@@ -15,15 +18,16 @@ from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock, since_boot
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
+from bms_estimator.pack_model.fit import PackFit
+from bms_estimator.process.disk_thread import DiskThread
 from bms_estimator.process.signals import acknowledge_on_signal
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import CheckpointWriter
-from bms_estimator.service.fit_thread import FitThread
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.request_handlers import RequestHandlers
 from bms_estimator.service.service_status import ServiceStatus
@@ -32,10 +36,52 @@ from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.serial.board_check import BoardCheck
 from bms_estimator.sources.source import Source
+from bms_estimator.telemetry.health import FitTimes
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
+
+LOG_S = 3600.0
+"""Minimum interval between two log lines for each kind of exception [s]; all failures are counted."""
+
+
+class FitThread:
+    """Runs the fits of one pack one after the other, and logs their failures.
+
+    Args:
+        clock: The clocks.
+        executor: Runs the fits; default: a daemon thread, so that the service can exit during a fit.
+
+    Attributes:
+        times: End and duration of the last fit, failed or not.
+    """
+
+    def __init__(self, clock: Clock, executor: Executor | None = None) -> None:
+        self._clock, self._executor = clock, executor or DiskThread("fit")  # for its daemon thread
+        self._logged_s: dict[str, float] = {}
+        self.times = FitTimes(None, None)
+
+    def submit(self, call: Callable[[], PackFit]) -> "Future[PackFit]":
+        """Queue a fit, and return its future."""
+        return self._executor.submit(self._measure, call)
+
+    def log_failure(self, error: BaseException) -> None:
+        """Log the exception of a fit, once in ``LOG_S`` for each kind."""
+        kind, now_s = type(error).__name__, self._clock.monotonic()
+        if now_s - self._logged_s.get(kind, -math.inf) >= LOG_S:
+            self._logged_s[kind] = now_s
+            log.warning("the fit of the pack's model failed; the previous fit stays", kind=kind, exc_info=error)
+
+    def _measure(self, call: Callable[[], PackFit]) -> PackFit:
+        started_s = self._clock.monotonic()
+        try:
+            return call()
+        finally:
+            self.times = FitTimes(self._clock.wall(), self._clock.monotonic() - started_s)
+
 
 LAG_STEP_S = 0.1
 """Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""
+SEND_TURNS = 2
+"""Number of turns of the event loop in which a published estimate is sent: one takes it from the outbox, one writes it."""
 STATUS_S = 60.0
 """Interval between two SOC texts for systemd [s]. The start and end of samples are reported at once."""
 
@@ -208,8 +254,12 @@ async def _estimate(
         publisher.alarm_monitor.check_silence()
         step = pack.run(received.samples, received.cells_v)
         totals.add(step.trace)
-        publisher.add(received, step, slots.fault)
-        await asyncio.sleep(0)  # a source that always has a block must not starve the sinks
+        try:
+            # the sinks send now, so that the alarms do not delay them and a source that always has a block does not starve them
+            for _ in range(SEND_TURNS if publisher.add_estimates(received, step) else 1):
+                await asyncio.sleep(0)
+        finally:  # the final save needs the alarms of all samples
+            publisher.add_to_alarms(received, step, slots.fault)
 
 
 async def _keep_alive(

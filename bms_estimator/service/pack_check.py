@@ -2,17 +2,15 @@
 
 from typing import TypeVar
 
-from bms_estimator.estimator.observer_conditions import observer_warnings
 from bms_estimator.estimator.settings_plausibility import implausible_settings
-from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.estimator.stability_conditions import observer_warnings
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.access_control import make_access_control
 from bms_estimator.process.systemd import is_for_the_service
 from bms_estimator.service.hook_check import hook_warnings
 from bms_estimator.settings.alarm_limits import implausible_limits
-from bms_estimator.settings.edge import EdgeSettings
-from bms_estimator.settings.exports import InfluxSettings
+from bms_estimator.settings.exports import EdgeSettings, InfluxSettings
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.page import PageSettings
@@ -69,11 +67,10 @@ def summarize(settings: Settings, cell: PackModel) -> str:
     if settings.edge:
         url = settings.edge.url
         broker += f"; samples to {url if isinstance(url, str) else ', '.join(url)}"
-    capacity = f"{cell.cell.capacity_ah:g} Ah" if isinstance(cell, CellModel) else "fuel cell"
     sensor = settings.sensor
     device = f"{sensor.protocol} board" if sensor.protocol in ("binary", "text") else sensor.protocol
     return (
-        f"{settings.pack.name}: {ratings.name}, {ratings.series_count} in series, {ratings.nominal_voltage_v:g} V, {capacity}; "
+        f"{settings.pack.name}: {ratings.name}, {ratings.series_count} in series, {ratings.nominal_voltage_v:g} V, {cell.capacity_text}; "
         f"{settings.source.short_description if settings.source else f'{device} on {sensor.port}'}; {broker}"
     )
 

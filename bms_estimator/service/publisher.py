@@ -6,13 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 import structlog
 
 from bms_estimator.estimator.cell_estimator import CellDeviations
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.forecast import ForecastReport
 from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealth
-from bms_estimator.model.payloads.info import Info
-from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.payloads.snapshot import ForecastReport, Info, Snapshot
 from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.latency import Latency
@@ -24,16 +21,19 @@ from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import make_cells_payload
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
-from bms_estimator.telemetry.health import dropped_text, make_health_payload, out_of_range_reason, sample_counters
+from bms_estimator.telemetry.health import (
+    dropped_text,
+    make_health_payload,
+    out_of_range_reason,
+    pack_model_health,
+    sample_counters,
+)
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
-from bms_estimator.telemetry.pack_model import pack_model_health
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.rest_detector import RestDetector
-from bms_estimator.telemetry.state import make_info_payload, make_state_payload
-from bms_estimator.telemetry.weakest_cell import estimate_fields
+from bms_estimator.telemetry.state import make_forecast_payload, make_info_payload, make_state_payload, no_forecast
+from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 
 log = structlog.get_logger(__name__)
 
@@ -87,10 +87,7 @@ class Publisher:
         self._board: Mapping[str, str] = {}
         self._latency = Latency()
         self._forecast_s = -math.inf  # time of the last payload of the curves
-        is_battery = isinstance(cell, CellModel)
-        self._no_forecast = no_forecast(
-            "the identifier is switched off" if is_battery else "a fuel cell has no state of charge"
-        )
+        self._no_forecast = no_forecast(cell.no_forecast_reason)
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
@@ -127,6 +124,15 @@ class Publisher:
             step: Result of the samples.
             cells_fault: Reason why the cell voltages cannot be used (``CellSlots.fault``); empty if they can.
         """
+        self.add_estimates(received, step)
+        self.add_to_alarms(received, step, cells_fault)
+
+    def add_estimates(self, received: ReceivedSamples, step: Step) -> bool:
+        """Do the first part of ``add``. Return True if it has published a snapshot.
+
+        The alarms follow in ``add_to_alarms``, so that their evaluation does not delay the estimate. The first snapshot follows
+        there, too, because it lists the alarms that the first samples permit.
+        """
         if self._status.source_health:
             self._latency.add(self._status.source_health().block_age_s)
         now_s, trace = self._clock.monotonic(), step.trace
@@ -137,11 +143,16 @@ class Publisher:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
         elif self._drop_reason is not None:
             self._drop_reason, self._dropped_before = None, self._dropped()
-        is_due = now_s >= self._due_s
-        if is_due and self.latest:  # before the alarms, so that their evaluation does not delay the estimate
-            self._publish_snapshot(now_s)
+        if now_s < self._due_s or not self.latest:
+            return False
+        self._publish_snapshot(now_s)
+        return True
+
+    def add_to_alarms(self, received: ReceivedSamples, step: Step, cells_fault: str = "") -> None:
+        """Do the second part of ``add``, after ``add_estimates``."""
+        now_s = self._clock.monotonic()
         alarm_changed = self.alarm_monitor.add(received, step, now_s, cells_fault)
-        if is_due and not self.latest:  # the first snapshot lists the alarms that the first samples permit
+        if not self.latest and now_s >= self._due_s:
             self.publish()
         elif alarm_changed:
             self._pass_to_sinks(self.snapshot._replace(estimate=None, alarms=self.alarm_monitor.report))
@@ -236,7 +247,7 @@ class Publisher:
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         # only saved values, so that the next run continues from there
         self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
-        capacity_ah = self._cell.cell.capacity_ah if isinstance(self._cell, CellModel) else None
+        capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:
             forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)

@@ -8,7 +8,7 @@ from typing import Protocol
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service.hook import Hook
 from bms_estimator.settings.alarms import AlarmHook

@@ -7,7 +7,7 @@ from bms_estimator.model.payloads.health import EdgeHealth, HookHealth, Recordin
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.sources.source import SourceHealth
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.pack_model import NO_FIT, FitTimes
+from bms_estimator.telemetry.health import NO_FIT, FitTimes
 
 
 @dataclass

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, AlarmKind
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
 from bms_estimator.settings.collapse_limit import collapse_limit
@@ -149,12 +149,10 @@ def _default_silent_limit_s(settings: Settings) -> float:
 
 def min_charge_current_a(cell: PackModel) -> float:
     """Return the minimum current that counts as charging [A]."""
-    # a fuel cell has no capacity
-    reference_a = cell.cell.capacity_ah if isinstance(cell, CellModel) else cell.cell.current_max_a
-    return MIN_CHARGE_C * reference_a
+    return MIN_CHARGE_C * cell.one_c_a
 
 
-def balancing_voltage_v(cell: CellModel) -> float:
+def balancing_voltage_v(cell: PackModel) -> float:
     """Return the cell voltage from which a balancer may be active [V].
 
     Args:
@@ -255,7 +253,7 @@ def _weak_cell_default(settings: Settings) -> _Default:
     return _Default(limit, WEAK_CELL_CLEAR_FRACTION * limit)
 
 
-def _voltage_limits(cell: CellModel) -> VoltageLimits:
+def _voltage_limits(cell: PackModel) -> VoltageLimits:
     """Return the default voltage limits of one cell of a pack."""
     nominal_v = cell.cell.nominal_voltage_v / cell.cell.series_count
     return next(limits for max_nominal_v, limits in _VOLTAGE_LIMITS if nominal_v < max_nominal_v)

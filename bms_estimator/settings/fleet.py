@@ -56,6 +56,10 @@ class ServerSettings(Strict):
         default=0,
         description="number of single cells of a pack whose voltages its edge sends, from which the sizes of the streams are computed",
     )
+    block_s: Annotated[float, Field(ge=1, le=3600)] = Field(
+        default=60.0,
+        description="shortest block_s of the edges [s], from which the number of blocks follows that the server stores of each pack",
+    )
     disk_gb: Gigabytes | None = Field(
         default=None, description="maximum size of all streams; default: three quarters of the free space at the start"
     )

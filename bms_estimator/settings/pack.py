@@ -10,10 +10,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.registry import max_batteries
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.charge_limits import ChargeLimits
-from bms_estimator.settings.edge import EdgeSettings
-from bms_estimator.settings.exports import InfluxSettings, PrometheusSettings
-from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.exports import EdgeSettings, InfluxSettings, PrometheusSettings
+from bms_estimator.settings.mqtt import HomeAssistantSettings, MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.settings.sampling import Sampling

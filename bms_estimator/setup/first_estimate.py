@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Self
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.service.live_loop import run_estimation_loop

@@ -9,7 +9,7 @@ from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.kernels.cells.records import ReadingFault
 from bms_estimator.model.arrays import Records
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads.cells import CellFaultName, CellReport, CellsReport
+from bms_estimator.model.payloads.snapshot import CellFaultName, CellReport, CellsReport
 from bms_estimator.telemetry.state import finite
 
 _FAULT_NAMES: dict[ReadingFault, CellFaultName] = {

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS, accumulate_charge_energy
-from bms_estimator.model.payloads.totals import Totals
+from bms_estimator.model.payloads.health import Totals
 
 
 class ChargeEnergy(NamedTuple):

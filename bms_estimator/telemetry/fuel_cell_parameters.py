@@ -8,7 +8,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import ACTIVATION, NAMES, TAFEL
 from bms_estimator.kernels.stability_margin import VALID_STD
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads.parameters import Parameter
+from bms_estimator.model.payloads.snapshot import Parameter
 from bms_estimator.telemetry.state import finite
 
 

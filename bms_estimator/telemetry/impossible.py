@@ -15,16 +15,10 @@ from bms_estimator.kernels.alarms import (
     MIN_MEAN_V,
 )
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import MAX_CELL_V, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import Quantity
 
-MAX_C_RATE = 100.0
-"""Highest possible current as a C-rate [1/h]. Power cells give 50 C. A higher current is a short circuit, which
-the fuse or the cell ends within a second."""
-MAX_CURRENT_RATIO = 10.0
-"""Highest possible current of a fuel cell in multiples of its maximum current. Its limiting current density is lower."""
 FACTORS = 10, 100, 1000
 """Usual factors between the scales or units of two devices."""
 FACTOR_TOLERANCE = 0.1
@@ -64,10 +58,7 @@ class PackBounds(NamedTuple):
     def of(cls, cell: PackModel) -> Self:
         """Return the bounds of the model of a whole pack."""
         c = cell.cell
-        max_a = (
-            MAX_C_RATE * cell.cell.capacity_ah if isinstance(cell, CellModel) else MAX_CURRENT_RATIO * c.current_max_a
-        )
-        return cls(c.series_count, max_a, (c.voltage_min_v, c.voltage_max_v), c.current_max_a)
+        return cls(c.series_count, cell.possible_a, (c.voltage_min_v, c.voltage_max_v), c.current_max_a)
 
     def find(self, samples: SampleBlock, cells: Floats) -> dict[Quantity, ImpossibleValue]:
         """Return the impossible values by quantity.

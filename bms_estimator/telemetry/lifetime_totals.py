@@ -10,7 +10,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads.totals import Totals
+from bms_estimator.model.payloads.health import Totals
 from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.health import sample_counters
 

@@ -1,13 +1,14 @@
 """Payload of the topic ``parameters``: a1..a21 and the circuit elements.
 
-Each value has its std, its source, and the reason if the value is not valid. Numbers in parentheses are equations of the
-thesis.
+Each value has its std, its source, and the reason if the value is not valid. a16..a21 are fitted to the OCV table of a cell
+file. Numbers in parentheses are equations of the thesis.
 """
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,14 +26,47 @@ from bms_estimator.estimator.identified_parameters import (
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.stability_margin import VALID_FIT_STD, VALID_STD
-from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.model.payloads.parameters import OcvCurve, Parameter, ParameterReport
+from bms_estimator.model.monotone_cubic import MonotoneCubic
+from bms_estimator.model.payloads.snapshot import OcvCurve, Parameter, ParameterReport
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
-from bms_estimator.telemetry.ocv_formula import fit_ocv_formula
 from bms_estimator.telemetry.series_resistance import series_resistance_parameters, settling_reason
 from bms_estimator.telemetry.state import finite
+
+POINTS = 101
+"""Number of evenly spaced SOCs at which (2.10) is fitted."""
+
+
+class OcvFormulaFit(NamedTuple):
+    """Fit of the polynomial and exponential (2.10) to an OCV table.
+
+    Attributes:
+        a: a16..a21.
+        std: Standard errors; NaN for a parameter at its bound.
+        rms_v: Deviation of the formula from the table, RMS over SOC [V].
+    """
+
+    a: tuple[float, ...]
+    std: tuple[float, ...]
+    rms_v: float
+
+
+def fit_ocv_formula(cell: CellModel) -> OcvFormulaFit | None:
+    """Fit (2.10) to a cell's OCV table; None if the cell file gives (2.10) itself."""
+    return _fit_table(cell.ocv) if isinstance(cell.ocv, TableOcv) else None
+
+
+@cache
+def _fit_table(ocv: TableOcv) -> OcvFormulaFit:
+    from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora  # noqa: PLC0415
+    from bms_estimator.calibration.ocv.points import Points, rms_v  # noqa: PLC0415
+
+    soc = np.linspace(0.0, 1.0, POINTS)
+    fit = fit_chen_mora(Points(soc, MonotoneCubic(ocv.soc, ocv.ocv_v)(soc), np.ones(POINTS)))
+    return OcvFormulaFit(tuple(map(float, fit.a)), tuple(map(float, fit.std)), rms_v(fit.residual_v))
+
 
 OCV_SOC = np.round(np.linspace(0.0, 1.0, 21), 2)
 """SOCs at which the OCV is published."""

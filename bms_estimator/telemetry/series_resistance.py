@@ -3,7 +3,7 @@
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.observer.series_resistance import MIN_CURRENT_C
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads.parameters import Parameter
+from bms_estimator.model.payloads.snapshot import Parameter
 from bms_estimator.telemetry.state import finite
 
 REASON = "by (4.2), step 3 of the thesis; includes errors of the OCV and of a1..a12, which std does not cover"

@@ -1,4 +1,4 @@
-"""Payloads of the topics ``state`` and ``info``."""
+"""Payloads of the topics ``state``, ``info`` and ``forecast``."""
 
 import math
 from collections.abc import Mapping
@@ -8,21 +8,106 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.forecast.forecast import Forecast
+from bms_estimator.forecast.forecast import FORECAST, Forecast, unknown_values
+from bms_estimator.kernels.accumulators.soc_certainty import MIN_UNKNOWN_STD
 from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.info import Info
 from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
+from bms_estimator.model.payloads.snapshot import ForecastReport, Info
 from bms_estimator.model.sample import ProbeBlock
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.forecast import forecast_fields
 from bms_estimator.telemetry.publish_window import WindowSummary
-from bms_estimator.telemetry.stability_margin import known_margin, missing_margin_reason
 from bms_estimator.version import __version__
+
+UNKNOWN_SOC = f"the SOC is not known yet: it is known once its standard deviation has fallen below {100.0 * MIN_UNKNOWN_STD:.0f} %"
+"""Reason without a known SOC."""
+ALWAYS_STABLE = "the thesis's model is valid at each SOC: delta_1 and delta_2 are not above 0"
+"""Reason with capacitances that are positive at each SOC."""
+NOT_IDENTIFIED = "delta_1 and delta_2 follow from a7..a12, which are not valid: see the topic parameters"
+"""Reason without a valid shape of the capacitances over SOC."""
+
+
+def known_margin(trace: Any, soc_known: Any) -> Any:
+    """Return the stability margin of rows of dtype TRACE, NaN without a margin or a known SOC.
+
+    Args:
+        trace: One row, or shape (n,).
+        soc_known: True where the SOC is known, of the same shape.
+    """
+    return np.where(soc_known, trace["stability_margin"], np.nan)
+
+
+def missing_margin_reason(row: np.void, *, soc_known: bool) -> str | None:
+    """Return the reason why a battery has no stability margin; None if it has one, and for a fuel cell.
+
+    Args:
+        row: Estimate, dtype TRACE.
+        soc_known: True if its SOC is known.
+    """
+    if math.isnan(row["soc"]):
+        return None
+    if math.isnan(row["stability_margin"]):
+        return NOT_IDENTIFIED if max(row["delta_1"], row["delta_2"]) > 0.0 else ALWAYS_STABLE
+    return None if soc_known else UNKNOWN_SOC
+
+
+NAMES = FORECAST.names or ()
+"""Fields of ``Estimate`` that a forecast supplies."""
+DURATIONS = tuple(name for name in NAMES if name.startswith("time_to_"))
+"""Fields that are durations, which decrease between two forecasts [s]."""
+CURVES = ("soc_p05", "soc_p50", "soc_p95", "voltage_p05_v", "voltage_p50_v", "voltage_p95_v", "survival")
+"""Fields of ``ForecastCurve`` and ``ForecastReport``."""
+
+
+def no_forecast(reason: str) -> Forecast:
+    """Return a forecast without values, for a pack without a forecaster."""
+    return Forecast(math.nan, unknown_values(), reason, None)
+
+
+def forecast_fields(forecast: Forecast, time_s: float) -> dict[str, Any]:
+    """Return the fields of ``Estimate`` that a forecast supplies. Durations count from the published sample.
+
+    Args:
+        forecast: The last forecast.
+        time_s: Time stamp of the published sample [s].
+    """
+    elapsed_s = max(time_s - forecast.time_s, 0.0)
+    values = dict(zip(NAMES, forecast.values[0].item(), strict=True))
+    values |= {name: max(values[name] - elapsed_s, 0.0) for name in DURATIONS if math.isfinite(values[name])}
+    known = {name: value if math.isfinite(value) else None for name, value in values.items()}
+    return known | {"forecast_reason": forecast.reason}
+
+
+def make_forecast_payload(forecast: Forecast, cutoff_v: float, window: WindowSummary, now_s: float) -> ForecastReport:
+    """Return the payload of the topic ``forecast``.
+
+    Args:
+        forecast: The last forecast.
+        cutoff_v: Voltage at which the load is switched off [V].
+        window: Summary since the last publication.
+        now_s: Wall clock [s since 1970].
+    """
+    curve = forecast.curve
+    age_s = max(float(window.last["time_s"]) - forecast.time_s, 0.0)
+    return ForecastReport(
+        time=iso_utc(max(window.arrival_s - age_s, 0.0) if math.isfinite(age_s) else window.arrival_s),
+        publish_time=iso_utc(now_s),
+        reason=forecast.reason,
+        cutoff_v=cutoff_v,
+        elapsed_s=_numbers(curve.elapsed_s) if curve else [],
+        **{name: _numbers(getattr(curve, name)) if curve else [] for name in CURVES},
+    )
+
+
+def _numbers(values: Floats) -> list[float | None]:
+    """Return values with five significant digits; None for NaN."""
+    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values.tolist()]
+
 
 NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
     dict.fromkeys(
@@ -151,7 +236,7 @@ def make_info_payload(
         payload_version=PAYLOAD_VERSION,
         started=iso_utc(started_s),
         cell=pack.cell.name,
-        capacity_ah=pack.cell.capacity_ah if isinstance(pack, CellModel) else None,
+        capacity_ah=pack.capacity_ah,
         series_count=pack.cell.series_count,
         nominal_voltage_v=pack.cell.nominal_voltage_v,
         observer="learning" if learns else f"{settings.observer.law}, {settings.observer.nussbaum}",

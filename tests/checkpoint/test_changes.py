@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.changes_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_BASE_AGE_S, MAX_SOC_CHANGE
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.model.arrays import fields

@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_FILES, CheckpointFile
-from bms_estimator.checkpoint.identity import pack_identity
-from bms_estimator.checkpoint.state_files import StateFiles
+from bms_estimator.checkpoint.arrays_file import pack_identity
+from bms_estimator.checkpoint.state_files import FORMAT, MAX_FILES, CheckpointFile, StateFiles
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.restore import restore_state
@@ -217,7 +216,7 @@ def test_a_checkpoint_without_anchors_is_restored_and_one_with_anchors_keeps_the
 def save_as(version: int, file: CheckpointFile, estimator: Estimator, monkeypatch: pytest.MonkeyPatch) -> None:
     """Save a checkpoint with the number ``version`` of its format."""
     with monkeypatch.context() as patch:
-        patch.setattr("bms_estimator.checkpoint.checkpoint_file.FORMAT", version)
+        patch.setattr("bms_estimator.checkpoint.state_files.FORMAT", version)
         file.save(estimator.record, whole=True)
 
 

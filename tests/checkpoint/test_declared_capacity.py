@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.state_files import StateFiles
+from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R
 from bms_estimator.model.cell import CellModel, load_cell

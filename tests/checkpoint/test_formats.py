@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint import arrays_file, checkpoint_file, run_file
+from bms_estimator.checkpoint import arrays_file, run_file, state_files
 from bms_estimator.edge import block
 from bms_estimator.fleet.worker.checkpoint import format_versions
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
@@ -19,7 +19,7 @@ from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
 
 
 def test_formats_have_their_numbers() -> None:
-    assert (checkpoint_file.FORMER_FORMAT, checkpoint_file.FORMAT) == (7, 8)
+    assert (state_files.FORMER_FORMAT, state_files.FORMAT) == (7, 8)
     assert (arrays_file.FORMAT, run_file.FORMAT) == (1, 1)
     assert (format_versions.FORMAT, format_versions.INCREMENT_FORMAT) == (3, 3)
     assert (block.VERSION, PAYLOAD_VERSION) == (3, 3)

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.identity import observer_identity, pack_identity
+from bms_estimator.checkpoint.arrays_file import observer_identity, pack_identity
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.fleet.packs.pack_type import config_digest
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.fuel_cell import PackModel, load_any
+from bms_estimator.model.pack_model import PackModel, load_any
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.settings.pack import Settings
 

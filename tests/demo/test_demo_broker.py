@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import aiomqtt
 import pytest
 
-from bms_estimator.demo.broker import DemoBroker
+from bms_estimator.demo.demo import DemoBroker
 from bms_estimator.model.errors import UserError
 from tests.free_port import free_port
 from tests.patience import LONG_S

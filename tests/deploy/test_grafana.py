@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.sinks.exports.line_protocol import ALARM, STATE, lines
+from bms_estimator.model.payloads.snapshot import Alarm
+from bms_estimator.sinks.exports.influx import ALARM, STATE, lines
 from tests.influxdb import INFLUXD, InfluxDB
 from tests.sinks.snapshots import CELL_SNAPSHOT, SOC_LOW_ALARM
 

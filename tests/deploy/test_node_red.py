@@ -10,8 +10,8 @@ from typing import Any, Self
 
 import pytest
 
-from bms_estimator.model.payloads.alarm import Alarm
 from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.sinks.mqtt.messages import MessageBuilder
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.sinks.exports.line_protocol import lines
+from bms_estimator.sinks.exports.influx import lines
 from bms_estimator.sinks.mqtt.messages import MessageBuilder
 from tests.sinks.snapshots import CELL_SNAPSHOT, SOC_LOW_ALARM
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.restore import restore_state

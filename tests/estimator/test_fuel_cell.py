@@ -15,7 +15,7 @@ from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
+from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")

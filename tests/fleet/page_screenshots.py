@@ -1,4 +1,4 @@
-"""Screenshots of docs/fleet/page.md in a real Chromium (``make screenshots``), of a simulated fleet on the real server."""
+"""Screenshots of docs/fleet/questions.md in a real Chromium (``make screenshots``), of a simulated fleet on the real server."""
 
 import asyncio
 import json

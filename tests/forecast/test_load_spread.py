@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from bms_estimator.forecast.load_spread import load_spread
+from bms_estimator.forecast.load_history import load_spread
 from bms_estimator.kernels.forecast.draws import DRAW, MAX_LOAD_FACTOR, draw_load_factors
 from tests.estimator.simulated_cell import measured
 from tests.forecast.simulated_load import forecasting_pack

@@ -19,7 +19,7 @@ from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, Pro
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.telemetry.alarms.sample_buffer import SampleBuffer
+from bms_estimator.telemetry.alarms.measured_values import SampleBuffer
 from bms_estimator.telemetry.impossible import PackBounds
 from tests.fuzz.edited_seeds import edit, edited_seeds, load_seeds
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from bms_estimator.checkpoint.checksum import add_checksum
+from bms_estimator.checkpoint.run_file import add_checksum
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.model.cell import load_cell

@@ -1,6 +1,6 @@
 """JSON of payloads: each object builds its JSON once."""
 
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 
 RAISED = Alarm(
     name="soc_low", severity="warning", active=True, latched=False, since=None, value=0.1, limit=0.1, unit=None, text=""

@@ -17,12 +17,12 @@ import pytest
 import pytest_asyncio
 from playwright.async_api import Browser
 
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.mqtt.topic_cache import MAX_DEVICES
 from bms_estimator.page.broker_page import dashboard
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.telemetry.forecast import forecast_fields, no_forecast
+from bms_estimator.telemetry.state import forecast_fields, no_forecast
 from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab

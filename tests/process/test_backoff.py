@@ -1,6 +1,6 @@
 """Delays before retries."""
 
-from bms_estimator.process.backoff import FIRST_DELAY_S, MAX_DELAY_S, Backoff
+from bms_estimator.process.tasks import FIRST_DELAY_S, MAX_DELAY_S, Backoff
 
 
 def test_delays_double_up_to_the_maximum_and_differ_between_clients() -> None:

@@ -18,14 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.checksum import add_checksum
-from bms_estimator.checkpoint.run_file import RunCounters
-from bms_estimator.checkpoint.state_files import StateFiles
+from bms_estimator.checkpoint.run_file import RunCounters, add_checksum
+from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.events import events
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.protocols.base.relay import Relay

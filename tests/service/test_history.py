@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.checkpoint.checkpoint_file import FORMAT, MAX_LATER_FILES, CheckpointFile
 from bms_estimator.checkpoint.run_file import RunCounters, RunFile
-from bms_estimator.checkpoint.state_files import StateFiles
+from bms_estimator.checkpoint.state_files import FORMAT, MAX_LATER_FILES, CheckpointFile, StateFiles
 from bms_estimator.estimator.estimator import new_estimator
-from bms_estimator.model.payloads.totals import Totals
+from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.service import checkpoint_writer
 from bms_estimator.service.live_loop import run_estimation_loop
@@ -216,7 +215,7 @@ async def test_a_checkpoint_of_a_later_version_is_restored_by_that_version_after
     before, command, _ = outcome.split("`")
     assert before.endswith("is installed again, stop the service and ")
     subprocess.run(command, shell=True, check=True)  # noqa: ASYNC221 - a user enters the command in a shell
-    monkeypatch.setattr("bms_estimator.checkpoint.checkpoint_file.FORMAT", FORMAT + 1)
+    monkeypatch.setattr("bms_estimator.checkpoint.state_files.FORMAT", FORMAT + 1)
     restored = (await run_samples(folder, samples=1)).health.checkpoint
     assert restored == f"restored: SOC {learned.state['soc'][0]:.4f}"
 

@@ -9,7 +9,7 @@ from bms_estimator.settings.alarms import HookEvent
 from tests.sinks.snapshots import SOC_LOW_ALARM
 
 if TYPE_CHECKING:
-    from bms_estimator.model.payloads.alarm import Alarm
+    from bms_estimator.model.payloads.snapshot import Alarm
 
 
 class Hook:

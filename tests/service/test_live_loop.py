@@ -20,10 +20,12 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.estimate import Estimate
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.live_loop import LAG_STEP_S, ServiceParts, run_estimation_loop
 from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.observer import IdentifierSettings
@@ -33,7 +35,7 @@ from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.rest_detector import REST_S
 from tests.collector import Collector
-from tests.patience import LONG_S
+from tests.patience import LONG_S, until
 from tests.scripted_source import ScriptedSource
 
 CELL = load_cell("chen_mora")
@@ -106,6 +108,31 @@ async def test_voltage_current_and_power_are_means_of_the_publish_window() -> No
     assert window.power_w == pytest.approx(3.9 / 2)  # the mean of the products of current and voltage
     assert window.sample_rate_hz == pytest.approx(100.0)
     assert window.frames_received == 100
+
+
+async def test_sinks_send_an_estimate_before_its_alarms_are_evaluated(monkeypatch) -> None:
+    events, loop = list[str](), asyncio.get_running_loop()
+    add, publish = AlarmMonitor.add, Collector.publish
+
+    def logged_add(*args: Any) -> bool:
+        events.append("alarms")
+        return add(*args)
+
+    def logged_publish(sink: Collector, snapshot: Snapshot) -> None:
+        publish(sink, snapshot)
+        if snapshot.estimate:  # as the outbox: one turn takes a message, the next one sends it
+            loop.call_soon(loop.call_soon, events.append, "sent")
+
+    monkeypatch.setattr(AlarmMonitor, "add", logged_add)
+    monkeypatch.setattr(Collector, "publish", logged_publish)
+    now_s = 0.0
+    async with run_loop(clock=Clock(monotonic=lambda: now_s)) as run:
+        for now_s in (0.2, 1.0, 1.01):
+            count = events.count("alarms")
+            run.source.give((now_s, 0.1, 3.8))
+            await until(lambda count=count: events.count("alarms") > count)
+    # the first snapshot lists alarms, and the last block is not published
+    assert events[:5] == ["alarms", "sent", "sent", "alarms", "alarms"]
 
 
 async def test_state_after_blocks_equals_that_after_single_steps() -> None:

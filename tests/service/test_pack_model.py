@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.arrays_file import FORMAT, ArraysFile
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.state_files import StateFiles
+from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.events import events
-from bms_estimator.model.payloads.pack_model import PackModelHealth
+from bms_estimator.model.payloads.health import PackModelHealth
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats

@@ -11,8 +11,7 @@ from structlog.testing import capture_logs
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.service.multi_pack_service import run_pack_services
-from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.service.pack_service import run_pack_service, run_pack_services
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from tests.patience import LONG_S

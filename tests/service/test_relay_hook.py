@@ -8,7 +8,7 @@ from typing import Any, Literal
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import relay_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks

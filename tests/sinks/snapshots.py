@@ -6,22 +6,20 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve, unknown_values
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.fuel_cell import PackModel, load_fuel_cell
-from bms_estimator.model.payloads.alarm import Alarm
-from bms_estimator.model.payloads.cells import CellReport, CellsReport
+from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.health import LoopHealth
-from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.payloads.snapshot import Alarm, CellReport, CellsReport, Snapshot
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.forecast import make_forecast_payload, no_forecast
 from bms_estimator.telemetry.health import make_health_payload
 from bms_estimator.telemetry.lifetime_totals import new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
-from bms_estimator.telemetry.state import make_info_payload, make_state_payload
+from bms_estimator.telemetry.state import make_forecast_payload, make_info_payload, make_state_payload, no_forecast
+from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 
 NOW = 1_700_000_000.0
 """Wall clock of the snapshots [s since 1970]."""

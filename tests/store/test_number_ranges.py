@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.store.number_ranges import NumberRanges
+from bms_estimator.store.outbox_queue import NumberRanges
 
 NUMBERS = st.sets(st.integers(-5, 30))
 

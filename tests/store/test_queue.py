@@ -1,8 +1,7 @@
 """Order of queued messages, without a disk."""
 
 from bms_estimator.mqtt.message import Message, QueuedMessage
-from bms_estimator.store.number_ranges import NumberRanges
-from bms_estimator.store.outbox_queue import MAX_TAIL, MIN_NUMBER, PAGE, OutboxQueue
+from bms_estimator.store.outbox_queue import MAX_TAIL, MIN_NUMBER, PAGE, NumberRanges, OutboxQueue
 
 
 def queue_with(count: int) -> OutboxQueue:

@@ -24,9 +24,9 @@ from bms_estimator.protocols.base.probe_check import probe_block
 from bms_estimator.settings.alarm_limits import AlarmDefinition, implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.measured_values import measured_values
+from bms_estimator.telemetry.alarms.sample_intervals import SampleCounts
 from bms_estimator.telemetry.alarms.state import AlarmState
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
 from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, knee_lines, record, replayed, settings

@@ -7,17 +7,17 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.fuel_cell import load_any
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.pack_model import load_any
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
+from bms_estimator.telemetry.alarms.sample_intervals import SampleCounts
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.stability_margin import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC
+from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 from tests.telemetry.alarm_captures import WALL_S, settings
 from tests.telemetry.published_state import published_state

@@ -8,14 +8,14 @@ import pytest
 
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.telemetry.alarms.estimate_alarms import UNKNOWN_SOC
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.faulty_fraction import SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
-from bms_estimator.telemetry.stability_margin import ALWAYS_STABLE, NOT_IDENTIFIED
+from bms_estimator.telemetry.alarms.sample_intervals import SampleCounts
+from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED
 from tests.telemetry.alarm_captures import PACK, WALL_S, settings
 
 

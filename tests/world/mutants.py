@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.sinks.mqtt.messages import MessageBuilder
 from bms_estimator.sources.serial.board_check import BoardCheck

@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import structlog
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.pack.state import REFUSED, PackState
 from bms_estimator.service import pack_service as service

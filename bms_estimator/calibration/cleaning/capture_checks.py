@@ -9,8 +9,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.charge_count import smaller_current_a
-from bms_estimator.model.time_faults import MIN_GAP_PERIODS
+from bms_estimator.model.charge_count import MIN_GAP_PERIODS, smaller_current_a
 
 MIN_PEAK_C_RATE = 0.1
 """Minimum peak C-rate of a capture that determines resistances [1/h]. A capture with a smaller one is useful only to

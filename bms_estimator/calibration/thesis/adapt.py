@@ -1,8 +1,10 @@
 """Calibration of a1..a15 by the procedure of the thesis "Adaptive Estimation of Li-ion Battery Model Parameters".
 
 a1..a15 are the coefficients of the elements of Chen and Mora's model: three for each of R_ts, R_tl, C_ts, C_tl and R_s
-as functions of SOC, (2.5)-(2.9) of the thesis. Step 1, the OCV, is part of the given cell. Step 2 is the adaptive
-observer for a1..a12, step 3 the fit of R_s, a13..a15. The result is scored by the replays of `identify`.
+as functions of SOC, (2.5)-(2.9) of the thesis. Step 1, the fit of the open-circuit voltage to rests, is the command `ocv`;
+its result is part of the given cell. Step 2 runs the adaptive observer (Algorithm 1) and averages its parameters by (3.19),
+which gives a1..a12. Step 3 computes R_s by (4.2) and fits its coefficients a13..a15. The result is scored by the replays
+of `identify`.
 """
 
 from collections.abc import Sequence
@@ -17,16 +19,109 @@ from bms_estimator.calibration.cleaning.start_soc import initial_soc
 from bms_estimator.calibration.elements.cell_from_fit import MIN_ERROR_V
 from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO
 from bms_estimator.calibration.elements.replay_score import interval_score
-from bms_estimator.calibration.thesis.adapt_steps import AdaptedElements, CaptureWithSoc, steps_2_and_3
+from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
 from bms_estimator.calibration.thesis.prediction import predict
-from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
-from bms_estimator.calibration.thesis.series_resistance import LOWEST_SOC
+from bms_estimator.calibration.thesis.series_resistance import (
+    LOWEST_SOC,
+    SeriesResistanceFit,
+    fit_series_resistance,
+    mean_of,
+    series_resistance,
+)
+from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, ROOM_C, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.cell_model.rc_ladder import weak_share
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, Ladder, Resistance
+from bms_estimator.model.cell import Bounds, CellModel, Ladder, Resistance, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.sample import SampleBlock
+from bms_estimator.settings.observer import ObserverSettings
+
+
+def printed_bounds(cell: CellModel) -> dict[str, Bounds]:
+    """Return the bounds and initial values of a1..a12 of Table 10, scaled from the pack of the thesis to ``cell``.
+
+    Resistances scale with the number of cells in series over the capacity, capacitances with its inverse. Exponents are
+    not scaled. No capture influences these bounds.
+    """
+    printed = load_cell("thunder_power_6s")
+    ohm_ratio = (cell.cell.series_count * printed.cell.capacity_ah) / (
+        printed.cell.series_count * cell.cell.capacity_ah
+    )
+    scaled_bounds = {}
+    for name, bounds in printed.adaptation.items():
+        element, coefficient = divmod(int(name[1:]) - 1, 3)
+        # each element has an amplitude, an exponent (1) and an offset; elements 2 and 3 are capacitances
+        factor = 1.0 if coefficient == 1 else 1.0 / ohm_ratio if element in (2, 3) else ohm_ratio
+        table = bounds.model_dump()
+        scaled = {key: factor * table[key] for key in ("upper", "lower", "initial") if table[key] is not None}
+        scaled_bounds[name] = Bounds.model_validate(table | scaled)
+    return scaled_bounds
+
+
+VOLTAGE_STEP_V = 1e-3
+"""Assumed resolution of a capture's voltage [V]."""
+
+
+@dataclass(frozen=True)
+class CaptureWithSoc:
+    """Samples of a capture without glitches, and its initial SOC.
+
+    Attributes:
+        samples: Dtype ``SAMPLE``.
+        soc: SOC at the first sample, 0..1.
+    """
+
+    samples: SampleBlock
+    soc: float
+
+
+@dataclass(frozen=True)
+class AdaptedElements:
+    """Result of steps 2 and 3.
+
+    Attributes:
+        run: Step 2, Algorithm 1 over one capture with the averages (3.19).
+        r_s: Step 3, a13..a15 fitted to (4.2) over all captures.
+    """
+
+    run: AdaptiveRun
+    r_s: SeriesResistanceFit
+
+    @property
+    def a(self) -> Floats:
+        """a1..a15 at index 1..15. Shape (16,)."""
+        a = self.run.average.copy()
+        a[13:16] = self.r_s.a
+        return a
+
+
+def steps_2_and_3(cell: CellModel, captures: Sequence[CaptureWithSoc], lowest_soc: float) -> AdaptedElements:
+    """Adapt a1..a12 to the capture with the smallest mean current, then fit a13..a15 to all captures.
+
+    Algorithm 1 needs a very small current; (4.2) needs several currents.
+
+    Args:
+        cell: Capacity, open-circuit voltage, and the bounds of (3.18).
+        captures: Captures that start from rest.
+        lowest_soc: SOC below which (4.2) is not evaluated, because the open-circuit voltage is uncertain there.
+
+    Raises:
+        UserError: No good sample, no current, or too small a range of SOC for a13..a15.
+    """
+    smallest = min(captures, key=lambda capture: float(np.abs(capture.samples["current_a"]).mean()))
+    observer = Estimator(
+        cell,
+        ObserverSettings(law="improved"),
+        identifier=None,
+        voltage_resolution_v=VOLTAGE_STEP_V,
+        initial_soc=smallest.soc,
+    )
+    run = adaptive_run(observer, smallest.samples)
+    predictions = [predict(cell, c.samples, c.soc, a=run.average, lowest_soc=lowest_soc) for c in captures]
+    curve = mean_of([series_resistance(cell, prediction) for prediction in predictions])
+    return AdaptedElements(run, fit_series_resistance(curve, lowest_soc))
 
 
 @dataclass(frozen=True)

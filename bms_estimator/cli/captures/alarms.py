@@ -30,7 +30,7 @@ from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.cli.options.silenced_log import silenced_log
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.kernel_warm_up import load_forecast_kernels

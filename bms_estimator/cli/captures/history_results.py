@@ -11,7 +11,8 @@ from bms_estimator.estimator.estimator import new_estimator
 from bms_estimator.estimator.identified_parameters import present_elements, relative_capacity
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import FuelCellModel, PackModel
+from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack_model.aging_course import aging_course
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.saved import history_of

@@ -39,7 +39,7 @@ from bms_estimator.model.arrays import Records
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack.pack import Pack, Step, new_pack
 from bms_estimator.service.kernel_warm_up import load_forecast_kernels

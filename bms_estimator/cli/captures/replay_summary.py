@@ -12,13 +12,11 @@ from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
-from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.pack.pack import Pack
 from bms_estimator.telemetry.cells import CELL_COLUMNS, make_cells_payload, weakest_cell_fields
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.stability_margin import known_margin, missing_margin_reason
-from bms_estimator.telemetry.state import finite
+from bms_estimator.telemetry.state import finite, known_margin, missing_margin_reason
 
 
 @dataclass(frozen=True)
@@ -207,8 +205,7 @@ def _learned_parameters(estimator: Estimator) -> dict[str, LearnedParameter]:
     if not estimator.state[0]["started"]:
         return {}
     report = make_parameters_payload(estimator, now_s=0.0)  # the time is not part of the result
-    parameters = report.elements if isinstance(estimator.cell, FuelCellModel) else report.a
-    return {name: LearnedParameter(p.value, p.std, p.valid) for name, p in parameters.items()}
+    return {name: LearnedParameter(p.value, p.std, p.valid) for name, p in (report.a or report.elements).items()}
 
 
 def _last_forecast(forecaster: Forecaster | None) -> dict[str, Any]:

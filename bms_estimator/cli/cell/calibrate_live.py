@@ -1,28 +1,37 @@
-"""Calibration beside a pack: reads samples, shows the instructions of a guided test, and switches the load."""
+"""Calibration beside a pack: reads samples, shows the instructions of a guided test, and switches the load.
+
+Screen of a calibration beside a pack: instruction, progress, and the voltages of the rests over SOC. No I/O.
+
+Limits of a pack in a guided test, from its settings and alarms.
+"""
 
 import asyncio
 import math
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
 from rich.text import Text
 
 from bms_estimator.calibration.guided_test.averages import means_of_windows
-from bms_estimator.calibration.guided_test.guided_test import GuidedTest
-from bms_estimator.calibration.guided_test.plan import PLANS
-from bms_estimator.cli.cell.calibration_screen import build_screen, instruction_text, measured_text, remaining_text
+from bms_estimator.calibration.guided_test.guided_test import GuidedTest, OcvPoint, Phase
+from bms_estimator.calibration.guided_test.plan import PLANS, Limits
 from bms_estimator.cli.cell.calibration_session import Session, join_recordings, start_time
 from bms_estimator.cli.cell.load_switch import LoadSwitch, SetLoad, board_relay
-from bms_estimator.cli.cell.pack_limits import pack_limits
+from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.tasks import end, until_first_ends
+from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
@@ -30,6 +39,112 @@ from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.line_source import LineSource
 from bms_estimator.sources.serial.port_list import NoPortError, PortBusyError, open_port, resolve_port
 from bms_estimator.sources.serial.serial_source import SerialSource
+
+CUTOFF_MARGIN_V = 0.02
+"""Distance of the default cut-off above the alarm for low voltage, per cell [V]."""
+DEFAULT_TAIL_C_RATE = 0.05
+"""Charge current at which a charge ends by default, as a C-rate [1/h]."""
+DEFAULT_MAX_TEMPERATURE_C = 60.0
+"""Maximum temperature of a pack without an alarm for high temperature [°C]. Most cells may be discharged up to it."""
+
+
+def pack_limits(settings: Settings, pack: CellModel) -> Limits:
+    """Return the limits of a pack, none of them beyond its alarms.
+
+    Args:
+        settings: Settings of the pack.
+        pack: Model of the whole pack.
+    """
+    cells, charge = pack.cell.series_count, settings.pack.charge_limits
+    alarms = {alarm.name: alarm.limit for alarm in monitored_alarms(settings, pack)}
+    grid_v = ocv_grid(pack)[0]
+    margin_v = CUTOFF_MARGIN_V * cells
+    lowest_v = alarms["pack_under_voltage"] + margin_v if "pack_under_voltage" in alarms else float(grid_v[0])
+    full_v = min(charge.full_voltage_v or float(grid_v[-1]), alarms.get("pack_over_voltage", math.inf))
+    cutoff_v = max(charge.cutoff_voltage_v or 0.0, lowest_v)
+    return Limits(
+        capacity_ah=pack.cell.capacity_ah,
+        series_count=cells,
+        full_v=full_v,
+        tail_a=charge.tail_current_a or DEFAULT_TAIL_C_RATE * pack.cell.capacity_ah,
+        cutoff_v=cutoff_v,
+        min_cell_v=alarms.get("cell_under_voltage", cutoff_v / cells - CUTOFF_MARGIN_V) + CUTOFF_MARGIN_V,
+        max_cell_v=alarms.get("cell_over_voltage", full_v / cells + CUTOFF_MARGIN_V),
+        max_discharge_a=power_limits(settings, pack).discharge_a,
+        max_temperature_c=alarms.get("over_temperature", DEFAULT_MAX_TEMPERATURE_C),
+    )
+
+
+CHART_WIDTH, CHART_HEIGHT = 50, 10
+"""Size of the chart without its labels [characters]."""
+BAR_WIDTH = 40
+"""Width of the progress bar [characters]."""
+
+
+def build_screen(test: GuidedTest, silence_reason: str | None) -> RenderableType:
+    """Return the screen.
+
+    Args:
+        test: The test in progress.
+        silence_reason: Reason why no samples arrive; None while they arrive.
+    """
+    lines: list[RenderableType] = [Text(test.instruction, style="bold cyan")]
+    warnings = (silence_reason, test.restart_reason, test.warning)
+    lines += [Text(warning, style="bold yellow") for warning in warnings if warning]
+    lines += [
+        Text(measured_text(test), style="dim"),
+        _progress_line(test),
+        Text(remaining_text(test)),
+    ]
+    if test.points:
+        lines += ["", *chart(test.points)]
+    return Group(*lines)
+
+
+def _progress_line(test: GuidedTest) -> Table:
+    line = Table.grid(padding=(0, 1))
+    bar = ProgressBar(total=1.0, completed=test.progress, width=BAR_WIDTH)
+    line.add_row(bar, f"{100.0 * test.progress:.0f} %")
+    return line
+
+
+def instruction_text(test: GuidedTest) -> str:
+    """Return the instruction, with the warnings about it."""
+    return " ".join(filter(None, (test.restart_reason, test.instruction, test.warning)))
+
+
+def measured_text(test: GuidedTest) -> str:
+    """Return the phase and the measured values."""
+    phase = test.phase.value
+    if test.phase in (Phase.DISCHARGE, Phase.REST):
+        phase += f" {test.discharge_number} of about {test.expected_discharges}"
+    now = test.latest
+    if now is None:
+        return f"{phase}; no sample yet"
+    return f"{phase}; {now.voltage_v:.3f} V, {now.current_a:+.2f} A, {test.drawn_ah:z.2f} Ah drawn"
+
+
+def remaining_text(test: GuidedTest) -> str:
+    """Return the remaining time and what it is estimated from."""
+    minutes = round(test.remaining_s / 60.0)
+    duration = f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{minutes} min"
+    return f"about {duration} left, {test.remaining_basis}"
+
+
+def chart(points: Sequence[OcvPoint]) -> list[str]:
+    """Return the lines of a chart of voltage over SOC 0..1."""
+    low_v, high_v = min(each.voltage_v for each in points), max(each.voltage_v for each in points)
+    span_v = max(high_v - low_v, 1e-3)
+    grid = [[" "] * CHART_WIDTH for _ in range(CHART_HEIGHT)]
+    for each in points:
+        column = round(min(max(each.soc, 0.0), 1.0) * (CHART_WIDTH - 1))
+        row = round((high_v - each.voltage_v) / span_v * (CHART_HEIGHT - 1))
+        grid[row][column] = "•"
+    labels = {0: f"{high_v:.3f} V", CHART_HEIGHT - 1: f"{low_v:.3f} V"}
+    rows = [f"{labels.get(i, ''):>10} │{''.join(row)}" for i, row in enumerate(grid)]
+    axis = f"{'':>10} └{'─' * CHART_WIDTH}"
+    return [*rows, axis, f"{'':>11}0 %{'SOC':^{CHART_WIDTH - 7}}100 %"]
+
 
 REDRAW_S = 0.5
 """Interval between two updates of the screen [s]."""

@@ -14,6 +14,9 @@ COMMANDS = {
     "user": LazyCommand(
         "bms_estimator.cli.fleet.serve:user", "Print the token with which the edge of a pack connects."
     ),
+    "users": LazyCommand(
+        "bms_estimator.cli.fleet.serve:users", "Write the tokens of the edges of all packs of a table."
+    ),
     "worker": LazyCommand(
         "bms_estimator.cli.fleet.worker:worker", "Run a worker, which estimates a share of the packs."
     ),
@@ -46,6 +49,9 @@ COMMANDS = {
         "bms_estimator.cli.fleet.queries:collect", "Write hourly summaries of all packs to Parquet files."
     ),
     "ask": LazyCommand("bms_estimator.cli.fleet.queries:ask", "Query the hourly summaries of all packs."),
+    "repair": LazyCommand(
+        "bms_estimator.cli.fleet.queries:repair", "Repair rows that arrived while the clock of the server was wrong."
+    ),
     "page": LazyCommand("bms_estimator.cli.fleet.page:page", "Serve a web page of all packs."),
     "simulate": LazyCommand(
         "bms_estimator.cli.fleet.simulate:simulate", "Simulate the edges of many packs, which send samples."

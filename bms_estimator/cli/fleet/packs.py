@@ -10,7 +10,7 @@ import tomlkit
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.counted import counted
+from bms_estimator.cli.options.table import counted
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.csv_table import CELL_FILE_SUFFIX, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
@@ -33,7 +33,7 @@ def load(
     table: Annotated[
         Path,
         typer.Argument(
-            help="CSV file with the columns pack, cell, capacity_ah, series ... (docs/fleet/packs.md)",
+            help="CSV file with the columns pack, cell, capacity_ah, series ... (docs/fleet/index.md)",
             show_default=False,
         ),
     ],
@@ -188,6 +188,7 @@ async def _load(path: Path, table: PackTable, files: dict[str, str], address: Se
 
 def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> None:
     """Erase packs from the server and from the Parquet files, and print what was erased and what remains."""
+    from bms_estimator.fleet.nats.stream_sizes import DAILY_CHECKPOINTS  # noqa: PLC0415
     from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
     from bms_estimator.fleet.queries.row_erasure import erase_rows  # noqa: PLC0415
 
@@ -202,12 +203,13 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
                 typer.echo(f"{folder}: {counted(erase_rows(folder, packs), 'row')} erased")
             except OSError as error:
                 raise UserError(f"--folder {folder}: cannot be written, repeat the command: {error.strerror}") from None
-    remaining = ["their names in the table of packs, as marks of their removal"]
+    remaining: list[str] = []
     if folder is None:
         remaining.append("their rows in the Parquet files of `fleet collect`: end it and repeat with --folder FOLDER")
     remaining += [
         "blocks on their edges, which they send again: stop the edges, revoke their tokens, delete PACK.edge.sqlite",
-        "earlier checkpoints in the server's files, until nats-server compacts these",
+        f"earlier checkpoints in the server's files OBJ_states, for at most {DAILY_CHECKPOINTS} days while workers save",
+        "former rows in the server's files KV_packs, until most rows of such a file of 4 MB were changed or removed",
         "last states on running fleet pages, until these are restarted",
         "backups of the server and of the Parquet files, files of `fleet capture`, logs of workers",
     ]
@@ -230,8 +232,7 @@ def _print_erasures(erasures: "dict[str, Erasure]") -> None:
             f"the state in {counted(erasure.checkpoints, 'checkpoint')} erased"
         )
         for stream, count in erasure.remaining.items():
-            if stream != f"KV_{PACKS_BUCKET}":
-                typer.echo(f"{pack}: remaining messages in the stream {stream}: {count}")
+            typer.echo(f"{pack}: remaining messages in the stream {stream}: {count}")
 
 
 async def _remove(packs: set[str], address: ServerAddress) -> None:

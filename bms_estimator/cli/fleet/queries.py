@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.table import print_table
+from bms_estimator.cli.options.table import counted, print_table
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
@@ -59,6 +59,21 @@ async def _collect(address: ServerAddress, folder: Path, period_s: float) -> Non
         await close(nc)
 
 
+def repair(
+    folder: Annotated[
+        Path, typer.Option(help="folder to which `fleet collect` writes, which must not run meanwhile")
+    ] = DEFAULT_FOLDER,
+) -> None:
+    """Repair rows that arrived while the clock of the server was wrong, as `fleet ask clocks` lists them."""
+    from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
+    from bms_estimator.fleet.queries.row_erasure import repair_arrivals  # noqa: PLC0415
+
+    if not folder.is_dir():
+        raise UserError(f"--folder {folder}: no such folder")
+    with only_collector(folder):
+        typer.echo(f"{folder}: {counted(repair_arrivals(folder), 'row')} repaired")
+
+
 def ask(
     name: Annotated[
         str | None,
@@ -96,6 +111,8 @@ def ask(
     else:
         limits = duckdb_queries.Limits(within_days=within)
         answer = duckdb_queries.run_query(folder, name, days=days, limits=limits)
+    for note in answer.notes:
+        typer.echo(f"note: {note}", err=True)
     (_print_json if json else _print_csv if csv else _print_table)(answer)
 
 

@@ -1,7 +1,8 @@
-"""``bms-estimator fleet serve`` and ``fleet user``: server node, and tokens for edges."""
+"""``bms-estimator fleet serve``, ``fleet user`` and ``fleet users``: server node, and tokens for edges."""
 
 import asyncio
 import os
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,6 +10,8 @@ from typing import Annotated, Any
 import typer
 from pydantic import TypeAdapter, ValidationError
 
+from bms_estimator.cli.options.table import counted
+from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts
 from bms_estimator.fleet.server.nats_server import serve as run_node
@@ -72,20 +75,25 @@ def serve(
     raise typer.Exit(exit_code)
 
 
+TenantName = Annotated[str, typer.Argument(help="name of the tenant, as in the settings", show_default=False)]
+SettingsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--settings", help="settings file of the fleet, fleet.toml; without a file, the default settings apply"
+    ),
+]
+ValidDays = Annotated[
+    float | None,
+    typer.Option(min=0.0, max=36_600.0, help="number of days for which a token is valid; default: unlimited"),
+]
+
+
 def user(
-    tenant: Annotated[str, typer.Argument(help="name of the tenant, as in the settings", show_default=False)],
+    tenant: TenantName,
     pack: Annotated[str, typer.Argument(help="name of the pack", show_default=False)],
-    settings_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--settings", help="settings file of the fleet, fleet.toml; without a file, the default settings apply"
-        ),
-    ] = None,
+    settings_file: SettingsOption = None,
     folder: Folder = None,
-    days: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=36_600.0, help="number of days for which the token is valid; default: unlimited"),
-    ] = None,
+    days: ValidDays = None,
 ) -> None:
     """Print the token of a pack's edge, which the edge uses as its MQTT password.
 
@@ -95,9 +103,30 @@ def user(
         TypeAdapter(DeviceName).validate_python(pack)
     except ValidationError:
         raise UserError(f"{pack!r}: not a pack name: at most 64 letters, digits, _ and -") from None
-    keys = NodeLocation(_folder(_settings(settings_file), folder)).keys
-    now = datetime.now(UTC)
-    typer.echo(credentials.edge_token(keys, tenant, pack, now, None if days is None else now + timedelta(days=days)))
+    typer.echo(_edge_tokens(tenant, [pack], settings_file, folder, days)[pack])
+
+
+def users(
+    tenant: TenantName,
+    table: Annotated[Path, typer.Argument(help="table of packs, as for `fleet packs load`", show_default=False)],
+    out: Annotated[
+        Path, typer.Option(help="folder for files PACK.token, or a CSV file NAME.csv; only you can read the files")
+    ],
+    settings_file: SettingsOption = None,
+    folder: Folder = None,
+    days: ValidDays = None,
+) -> None:
+    """Write the tokens of the edges of all packs of a table, as `fleet user` prints them one by one."""
+    packs = read_table(table).packs
+    credentials.write_tokens(out, _edge_tokens(tenant, packs, settings_file, folder, days))
+    typer.echo(f"{out}: {counted(len(packs), 'token')} written; keep them secret")
+
+
+def _edge_tokens(
+    tenant: str, packs: Iterable[str], settings_file: Path | None, folder: Path | None, days: float | None
+) -> dict[str, str]:
+    keys, now = NodeLocation(_folder(_settings(settings_file), folder)).keys, datetime.now(UTC)
+    return credentials.edge_tokens(keys, tenant, packs, now, None if days is None else now + timedelta(days=days))
 
 
 def _settings(path: Path | None, **options: str | None) -> FleetSettings:

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.counted import counted
-from bms_estimator.cli.options.table import print_table
+from bms_estimator.cli.options.table import counted, print_table
 
 if TYPE_CHECKING:
     from bms_estimator.fleet.heartbeat import Heartbeat
@@ -109,11 +108,11 @@ async def _read_streams(address: ServerAddress) -> "tuple[str, DeadPacks]":
     from bms_estimator.fleet.nats.dead_packs import DeadPackReader  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.nats.streams import partitions_of  # noqa: PLC0415
-    from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning  # noqa: PLC0415
+    from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks  # noqa: PLC0415
 
     async with connected(*address) as nc:
         partitions = await partitions_of(nc)
-        warning = unsaved_warning(await unsaved_share(nc, range(partitions))) if partitions is not None else ""
+        warning = (await unsaved_blocks(nc, range(partitions))).warning if partitions is not None else ""
         return warning, await DeadPackReader(nc).read()
 
 

@@ -33,7 +33,7 @@ from bms_estimator.forecast.trip import MAX_LOAD, MAX_TRIP_S, Trip, constant_tri
 from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.reports.formats import duration_text, number

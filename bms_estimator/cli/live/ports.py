@@ -11,7 +11,7 @@ from serial.tools import list_ports
 
 from bms_estimator.cli.options.number_options import whole
 from bms_estimator.cli.options.port_options import complete_port
-from bms_estimator.cli.options.status_line import show_status
+from bms_estimator.cli.options.table import show_status
 from bms_estimator.sources.serial.device_detection import probe as probe_port
 from bms_estimator.sources.serial.port_list import holder, stable_names
 

@@ -16,13 +16,12 @@ from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
 from bms_estimator.cli.options.port_options import OtherPort
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import startup_signals
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.kernel_warm_up import load_kernels
-from bms_estimator.service.multi_pack_service import run_pack_services
-from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.service.pack_service import run_pack_service, run_pack_services
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.terminal.screen import LOG_LINES
 from bms_estimator.sinks.terminal.sink import TerminalSink

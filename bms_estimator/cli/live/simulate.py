@@ -12,7 +12,7 @@ from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.model.cell import Cell, is_fuel_cell, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_fuel_cell
-from bms_estimator.model.suggestion import suggestion
+from bms_estimator.model.one_of import suggestion
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.tasks import until_first_ends

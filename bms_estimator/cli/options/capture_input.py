@@ -1,20 +1,48 @@
-"""Captures as arguments of a command: files or standard input. Guesses about their format are printed on stderr."""
+"""Captures as arguments of a command: files or standard input. Guesses about their format are printed on stderr.
 
+Capture from a pipe, copied to a file because readers need a file's size and read it twice.
+"""
+
+import shutil
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import typer
 
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.model.charge_count import gap_warnings
+from bms_estimator.model.charge_count import TimeFaults, gap_warnings
 from bms_estimator.model.columns import Columns
+from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress, no_progress
 from bms_estimator.model.sample import CurrentSign, SampleBlock
-from bms_estimator.model.time_faults import TimeFaults
 from bms_estimator.sources.captures.replay import Capture, open_capture, read_samples
-from bms_estimator.sources.captures.stdin import standard_input
 from bms_estimator.sources.captures.tables.layout import ColumnMap
+
+DISPLAY_NAME = "stdin"
+"""Name used in messages."""
+
+
+@contextmanager
+def standard_input() -> Iterator[Path]:
+    """Copy stdin to a temporary file; yield its path, and delete it on exit.
+
+    Raises:
+        UserError: Stdin is closed. An error raised inside the context shows ``stdin`` instead of the temporary path.
+    """
+    if not sys.stdin:
+        raise UserError(f"{DISPLAY_NAME}: closed; nothing can be read from it")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / DISPLAY_NAME
+        with path.open("wb") as file:
+            shutil.copyfileobj(sys.stdin.buffer, file)
+        try:
+            yield path
+        except UserError as error:
+            raise UserError(str(error).replace(str(path), DISPLAY_NAME)) from None
+
 
 LONG_FILE_BYTES = 5_000_000
 """Size from which a bar is shown while a file is read. Smaller files are read within a few seconds."""

@@ -1,6 +1,8 @@
 """Progress bar on stderr while kernels compile.
 
 A first start compiles for 22 s on two idle cores. Later starts load the kernels from the cache.
+
+Bar with label, percentage and time left, in the same form for all commands.
 """
 
 import signal
@@ -10,10 +12,24 @@ from contextlib import ExitStack, contextmanager
 
 from numba.core import event
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from bms_estimator.cli.options.bar import new_bar
 from bms_estimator.numba_cache import count_cached_kernels, count_kernels
+
+BAR_WIDTH = 24
+"""Width of the bar [characters]. With a long label, the line fits into 80 columns."""
+
+
+def new_bar(console: Console) -> Progress:
+    """Return a bar that disappears at its end. It writes nothing if the console is not a terminal."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(BAR_WIDTH),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
+    return Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
+
 
 COMPILE_TEXT = "compiling the kernels; this takes up to a minute, and later starts use the cache"
 """Line on a stderr that is not a terminal."""

@@ -7,7 +7,8 @@ from pydantic import ValidationError
 from bms_estimator.model.cell import CellModel, generic_cells, load_cell
 from bms_estimator.model.config_file import error_reason, without_secrets
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import FuelCellModel, PackModel, load_any
+from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.model.pack_model import PackModel, load_any
 from bms_estimator.protocols.base.device import BMS_GAIN_STD
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import PackSettings, Settings, load_settings

@@ -7,8 +7,7 @@ from numba.core import event
 from rich.console import Console
 from rich.progress import Progress
 
-from bms_estimator.cli.options.bar import new_bar
-from bms_estimator.cli.options.compile_progress import COMPILE_TEXT, CompileListener
+from bms_estimator.cli.options.compile_progress import COMPILE_TEXT, CompileListener, new_bar
 
 MIN_CHANGE = 0.001
 """Minimum change of the fraction that is drawn. A calculation may report its progress more often."""

@@ -1,10 +1,23 @@
-"""Table on stdout."""
+"""Output of commands: a table, a number with its noun, and the status line of a command that waits."""
 
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
+
+
+def show_status(text: str) -> AbstractContextManager[object]:
+    """Show a text with a spinner within the context, if stderr is a terminal."""
+    console = Console(stderr=True)
+    return console.status(text) if console.is_terminal else nullcontext()
+
+
+def counted(count: int, noun: str, plural: str | None = None) -> str:
+    """Return a number with a noun in singular or plural; ``plural`` is the noun with an s by default."""
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
+
 
 MAX_TABLE_WIDTH = 10_000
 """Maximum width of a printed table [characters], above that of any result."""

@@ -11,7 +11,7 @@ from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.service.pack_check import check_settings, summarize
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings

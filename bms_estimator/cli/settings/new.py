@@ -15,7 +15,7 @@ import typer
 
 from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.status_line import show_status
+from bms_estimator.cli.options.table import show_status
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
 from bms_estimator.cli.settings.prompts import Prompts
 from bms_estimator.installation.root_command import root_command

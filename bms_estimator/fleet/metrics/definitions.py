@@ -130,6 +130,11 @@ TENANT: tuple[Definition[TenantState], ...] = (
         "Part of RAW that no checkpoint includes, by size or age, whichever is larger; computed once a minute",
         lambda s: s.unsaved_share,
     ),
+    Definition(
+        "bms_fleet_silent_packs",
+        "Packs of the table of which no hourly summary has arrived for 3 h; computed once a minute",
+        lambda s: s.silent,
+    ),
     Definition("bms_fleet_mqtt_sessions", "MQTT sessions, including those of disconnected edges", _mqtt_sessions),
     Definition("bms_fleet_stream_messages", "Stored messages of a stream", _of_streams(lambda s: s.messages), "stream"),
     Definition("bms_fleet_stream_bytes", "Size of a stream", _of_streams(lambda s: s.stored_bytes), "stream"),

@@ -30,12 +30,14 @@ class TenantState:
         undelivered: Number of undelivered messages by partition; None: the server does not answer.
         streams: Streams and buckets by name; None: the server does not answer.
         unsaved_share: Part of the stream ``RAW`` that no checkpoint includes (``unsaved_blocks``); None before the first check.
+        silent: Number of packs of the table without a recent summary (``arrival_watch``); None before the first check.
     """
 
     heartbeats: tuple[Heartbeat, ...] = ()
     undelivered: Mapping[int, int] | None = None
     streams: Mapping[str, StreamState] | None = None
     unsaved_share: float | None = None
+    silent: int | None = None
 
     @property
     def unowned(self) -> frozenset[int] | None:

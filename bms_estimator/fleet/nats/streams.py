@@ -77,6 +77,7 @@ async def make_streams(
     raw_age_s: float = RAW_AGE_S,
     states_bytes: int = UNLIMITED,
     history_bytes: int = UNLIMITED,
+    max_pack_blocks: int | None = None,
 ) -> None:
     """Create missing streams and consumers, and set limits and replicas as configured. The function is idempotent.
 
@@ -88,6 +89,7 @@ async def make_streams(
         raw_age_s: Maximum age of messages in ``RAW`` [s].
         states_bytes: Maximum size of the checkpoints [bytes]; beyond it the workers remove daily ones.
         history_bytes: Maximum size of the histories [bytes]; beyond it the oldest messages are dropped.
+        max_pack_blocks: Maximum number of blocks of one pack in ``RAW``; default: ``pack_blocks``.
 
     Raises:
         UserError: The streams have another number of partitions, or the server has too little disk space.
@@ -100,7 +102,7 @@ async def make_streams(
             "the number of a stream cannot change"
         )
     streams = (
-        _raw_stream(partitions, raw_bytes, raw_age_s),
+        _raw_stream(partitions, raw_bytes, raw_age_s, max_pack_blocks or pack_blocks(raw_bytes)),
         _hours_stream(raw_bytes),
         _dead_stream(raw_bytes),
         *_fit_streams(history_bytes),
@@ -168,13 +170,13 @@ def pack_blocks(raw_bytes: int) -> int:
     return max(round(PACK_FRACTION * raw_bytes / MAX_BLOCK_BYTES), MIN_PACK_BLOCKS)
 
 
-def _raw_stream(partitions: int, max_bytes: int, age_s: float) -> dict[str, Any]:
+def _raw_stream(partitions: int, max_bytes: int, age_s: float, max_pack_blocks: int) -> dict[str, Any]:
     source, destination = subjects.mapping(partitions)
     limits = {
         "max_bytes": max_bytes,
         "max_age": _ns(age_s),
         "max_msg_size": MAX_BLOCK_BYTES,
-        "max_msgs_per_subject": pack_blocks(max_bytes),
+        "max_msgs_per_subject": max_pack_blocks,
         "discard": "old",
         "allow_direct": True,
     }

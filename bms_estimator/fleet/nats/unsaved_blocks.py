@@ -5,8 +5,11 @@ When it reaches 1, the stream drops blocks that no checkpoint includes, and the 
 
 import time
 from collections.abc import Iterable
+from typing import NamedTuple
 
 from nats.aio.client import Client
+from nats.js.api import RawStreamMsg
+from nats.js.client import JetStreamContext
 from nats.js.errors import KeyNotFoundError, NotFoundError
 from nats.js.kv import KeyValue
 from pydantic import ValidationError
@@ -16,50 +19,109 @@ from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
 
 WARNING_SHARE = 0.5
 """Share above which operators are warned."""
+MIN_BLOCK_S = 1.0
+"""Minimum duration of a block [s], from which the shortest time follows in which a pack reaches its limit of blocks."""
+MAX_CHECKED_PACKS = 3
+"""Number of packs of a partition with the most blocks that are checked for their limit."""
 
 
-async def unsaved_share(nc: Client, partitions: Iterable[int]) -> float:
-    """Return the part of the stream from the first block after a checkpoint on, by size or age, whichever is larger.
+class Unsaved(NamedTuple):
+    """Share of the stream that no checkpoint includes."""
+
+    share: float = 0.0
+    """Largest share by size, by age, or of the blocks that the stream stores of one pack; 0 to 1."""
+    pack: str = ""
+    """Pack, if the share is that of its blocks."""
+    max_blocks: int = 0
+    """Maximum number of stored blocks of a pack."""
+
+    @property
+    def warning(self) -> str:
+        """Warning if more than half is unsaved; otherwise an empty text."""
+        if self.share <= WARNING_SHARE:
+            return ""
+        if not self.pack:
+            return (
+                f"{self.share:.0%} of the stream {subjects.RAW_STREAM} are blocks that no checkpoint includes: "
+                "start workers, or increase packs or outage_days of the server"
+            )
+        limit = f"the stream {subjects.RAW_STREAM}, which stores {self.max_blocks} blocks of a pack"
+        if self.share >= 1.0:
+            text = f"{limit}, has dropped blocks of {self.pack} that no checkpoint includes"
+        else:
+            text = f"{self.share:.0%} of the blocks of {self.pack} in {limit}, are in no checkpoint"
+        return f"{text}: start workers, and set block_s of the server to the block_s of the edges"
+
+
+async def unsaved_blocks(nc: Client, partitions: Iterable[int]) -> Unsaved:
+    """Return the part of the stream from the first block after a checkpoint on.
+
+    The size is computed with the mean size of all messages.
 
     Args:
         nc: Connection to the tenant's NATS account.
         partitions: Numbers of the partitions whose checkpoints are considered.
 
-    Returns:
-        The share, 0 to 1. The size is computed with the mean size of all messages.
-
     Raises:
         nats.errors.Error: The stream or the bucket cannot be read.
     """
-    js = nc.jetstream()
+    js, now_s = nc.jetstream(), time.time()
     raw = await js.stream_info(subjects.RAW_STREAM)
     bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
-    oldest_sequence, oldest_s = raw.state.last_seq + 1, time.time()
+    max_blocks = max(raw.config.max_msgs_per_subject or 0, 0)
+    oldest_sequence, oldest_s, of_pack = raw.state.last_seq + 1, now_s, Unsaved()
     for partition in partitions:
         first = await _saved_sequence(bucket, partition) + 1
-        try:
-            message = await js.get_msg(subjects.RAW_STREAM, first, subject=subjects.stored(partition), next=True)
-        except NotFoundError:
+        message = await _message(js, subjects.stored(partition), first)
+        if message is None:
             continue
-        if message.time is not None:
-            oldest_s = min(oldest_s, message.time.timestamp())
+        oldest_s = min(oldest_s, _time_s(message, now_s))
         oldest_sequence = min(oldest_sequence, message.seq or oldest_sequence)
+        if max_blocks and now_s - _time_s(message, now_s) > WARNING_SHARE * MIN_BLOCK_S * max_blocks:
+            of_pack = max(of_pack, await _unsaved_of_packs(js, partition, first, max_blocks))
     mean_bytes = raw.state.bytes / max(1, raw.state.messages)
     unsaved_bytes = mean_bytes * (raw.state.last_seq + 1 - oldest_sequence)
     max_bytes, max_age_s = raw.config.max_bytes or 0, raw.config.max_age or 0.0
     by_size = unsaved_bytes / max_bytes if max_bytes > 0 else 0.0
-    by_age = (time.time() - oldest_s) / max_age_s if max_age_s > 0.0 else 0.0
-    return min(1.0, max(by_size, by_age))
+    by_age = (now_s - oldest_s) / max_age_s if max_age_s > 0.0 else 0.0
+    return max(Unsaved(min(1.0, max(by_size, by_age))), of_pack)
 
 
-def unsaved_warning(share: float) -> str:
-    """Return a warning if more than half of the stream is unsaved; otherwise an empty text."""
-    if share <= WARNING_SHARE:
-        return ""
-    return (
-        f"{share:.0%} of the stream {subjects.RAW_STREAM} are blocks that no checkpoint includes: "
-        "start workers, or increase packs or outage_days of the server"
-    )
+async def _unsaved_of_packs(js: JetStreamContext, partition: int, first: int, max_blocks: int) -> Unsaved:
+    """Return the largest unsaved share of a pack's limit in a partition.
+
+    The number of the unsaved blocks follows from their time, as a part of the time of all blocks of the pack.
+
+    Args:
+        js: JetStream of the tenant.
+        partition: Number of the partition.
+        first: First stream sequence number after the checkpoint.
+        max_blocks: Maximum number of stored blocks of a pack.
+    """
+    info = await js.stream_info(subjects.RAW_STREAM, subjects_filter=subjects.stored_raw(partition))
+    counts = sorted((info.state.subjects or {}).items(), key=lambda each: -each[1])
+    result, now_s = Unsaved(), time.time()
+    for subject, count in counts[:MAX_CHECKED_PACKS]:
+        oldest, unsaved = await _message(js, subject, 1), await _message(js, subject, first)
+        if oldest and unsaved:
+            begin_s = _time_s(oldest, now_s)
+            part = (now_s - _time_s(unsaved, now_s)) / (now_s - begin_s) if now_s > begin_s else 0.0
+            share = min(1.0, part * count / max_blocks)
+            result = max(result, Unsaved(share, subject.rpartition(".")[2], max_blocks))
+    return result
+
+
+async def _message(js: JetStreamContext, subject: str, first: int) -> RawStreamMsg | None:
+    """Return the first stored message of a subject from a sequence number on; None without one."""
+    try:
+        return await js.get_msg(subjects.RAW_STREAM, first, subject=subject, next=True)
+    except NotFoundError:
+        return None
+
+
+def _time_s(message: RawStreamMsg, now_s: float) -> float:
+    """Return the time of a message's arrival [s since 1970]; the present time without one."""
+    return now_s if message.time is None else message.time.timestamp()
 
 
 async def _saved_sequence(bucket: KeyValue, partition: int) -> int:

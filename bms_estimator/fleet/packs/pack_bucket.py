@@ -10,15 +10,14 @@ import nats.js.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StoredMessage, StreamError, read_stream
+from bms_estimator.fleet.nats.bucket_reader import BucketReader, entry, stream_of, subject_of
+from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StreamError, read_stream
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 
 POLL_S = 1.0
 """Poll interval for changes [s]."""
 MAX_PENDING = 2000
 """Maximum number of written rows that wait for the server's acknowledgment."""
-_REMOVING_OPERATIONS = frozenset({"DEL", "PURGE"})
 
 
 @dataclass(frozen=True)
@@ -48,16 +47,14 @@ class PackBucket:
     def __init__(self, nc: Client) -> None:
         self.packs = PackRegistry()
         self.faults, self.fault = 0, ""
-        self._nc = nc
-        self._next_sequence = {PACKS_BUCKET: 1, CELLS_BUCKET: 1}
-        self._created: dict[str, object] = {}  # creation times of the streams with these sequence numbers
+        self._readers = {bucket: BucketReader(nc, bucket) for bucket in (CELLS_BUCKET, PACKS_BUCKET)}
         self._changed: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
 
     async def refresh(self) -> set[str]:
         """Read the changes since the last call, and return the affected packs. The first call reads everything.
 
         Raises:
-            StreamError: The server does not respond, or has no such bucket.
+            StreamError: The server does not respond, or has no such bucket. The next call includes what was read.
         """
         await self._read(CELLS_BUCKET, self.packs.set_cell)  # before the rows that name the cells
         await self._read(PACKS_BUCKET, self.packs.set_row)
@@ -66,21 +63,11 @@ class PackBucket:
         return changed
 
     async def _read(self, bucket: str, set_value: Callable[[str, bytes | None], bool]) -> None:
-        """Read the changed keys of a bucket. They remain in ``_changed`` for the next refresh if this refresh fails."""
-        try:
-            info = await self._nc.jetstream().stream_info(_stream(bucket))
-        except nats.errors.Error as error:
-            raise StreamError(f"the server rejects reading {_stream(bucket)}: {error_text(error)}") from None
-        is_recreated = info.created != self._created.get(bucket)
-        if is_recreated or info.state.last_seq + 1 < self._next_sequence[bucket]:  # numbers are used again
-            self._next_sequence[bucket] = 1
-        self._created[bucket] = info.created
-        async for batch in read_stream(self._nc, _stream(bucket), _key(bucket, ">"), first=self._next_sequence[bucket]):
-            for message in batch:
-                key, data = _entry(bucket, message)
-                if set_value(key, data):
-                    self._changed[bucket].add(key)
-            self._next_sequence[bucket] = batch[-1].sequence + 1
+        def set_changed(key: str, data: bytes | None) -> None:
+            if set_value(key, data):
+                self._changed[bucket].add(key)
+
+        await self._readers[bucket].read(set_changed)
 
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
         """Poll for changes until cancelled; call ``changed`` with the packs whose row or cell has changed.
@@ -106,9 +93,9 @@ async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
         StreamError: The server does not respond, or has no such bucket.
     """
     values = dict[str, bytes]()
-    async for batch in read_stream(nc, _stream(bucket), _key(bucket, ">")):
+    async for batch in read_stream(nc, stream_of(bucket), subject_of(bucket, ">")):
         for message in batch:
-            key, data = _entry(bucket, message)
+            key, data = entry(bucket, message)
             if data is None:
                 values.pop(key, None)
             else:
@@ -153,6 +140,16 @@ async def remove_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
     await put(nc, bucket, dict.fromkeys(keys, b""), {"KV-Operation": "DEL"})
 
 
+async def purge_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
+    """Remove keys and the marks of their removal from a bucket. Readers of the bucket then read it from its beginning.
+
+    Raises:
+        nats.js.errors.APIError: The server rejects the request.
+    """
+    for key in keys:
+        await nc.jetstream().purge_stream(stream_of(bucket), subject=subject_of(bucket, key))
+
+
 async def put(
     nc: Client, bucket: str, values: Mapping[str, bytes], headers: Mapping[str, str] = MappingProxyType({})
 ) -> None:
@@ -165,24 +162,10 @@ async def put(
     try:
         for first in range(0, len(entries), MAX_PENDING):
             acks = [
-                await js.publish_async(_key(bucket, key), data, headers=dict(headers) or None)
+                await js.publish_async(subject_of(bucket, key), data, headers=dict(headers) or None)
                 for key, data in entries[first : first + MAX_PENDING]
             ]
             async with asyncio.timeout(RESPONSE_TIMEOUT_S):
                 await asyncio.gather(*acks)
     except (TimeoutError, nats.errors.Error, nats.js.errors.Error) as error:
         raise StreamError(f"the server does not store rows of {bucket}: {error}") from None
-
-
-def _entry(bucket: str, message: StoredMessage) -> tuple[str, bytes | None]:
-    """Return key and value of a message; the value None means that the key was removed."""
-    is_removed = message.headers.get("KV-Operation") in _REMOVING_OPERATIONS or "Nats-Marker-Reason" in message.headers
-    return message.subject.removeprefix(_key(bucket, "")), None if is_removed else message.data
-
-
-def _stream(bucket: str) -> str:
-    return f"KV_{bucket}"
-
-
-def _key(bucket: str, key: str) -> str:
-    return f"$KV.{bucket}.{key}"

@@ -11,7 +11,7 @@ from bms_estimator.fleet.packs.pack_row import PackSpec, decode_row, known_cells
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.pack import Settings
 
 MAX_CACHED_SPECS = 1024

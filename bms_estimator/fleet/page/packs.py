@@ -55,18 +55,17 @@ class Concern(NamedTuple):
 
     column: str
     """Column of the ranking."""
-    is_low_bad: bool
-    """True if the smallest values are the worst."""
     limit: float
-    """Limit beyond which a pack is counted."""
+    """Limit below which a pack is counted."""
 
 
 CONCERNS = {
-    "margin": Concern("margin", is_low_bad=True, limit=0.05),
-    "soc": Concern("soc", is_low_bad=True, limit=0.1),
-    "uncertain": Concern("soc_std", is_low_bad=False, limit=0.05),
+    "margin": Concern("margin", limit=0.05),
+    "soc": Concern("soc", limit=0.1),
 }
-"""Criteria of live packs, by name."""
+"""Criteria of live packs, by name. The smallest values are the worst."""
+MAX_STD = 0.05
+"""Standard deviation of SOC above which a live pack counts as uncertain. Each pack is uncertain in its first hours."""
 
 
 class FleetPacks:
@@ -158,6 +157,7 @@ class FleetPacks:
                 "alive": int(alive.sum()),
                 "silent": int(silent.sum()),
                 "unlisted": int((counted & ~rows["listed"]).sum()),
+                "uncertain": int((alive & (rows["soc_std"] > MAX_STD)).sum()),
             },
             "types": self._types_overview(rows, counted, alive),
             "soc_std_edges": STD_EDGES[:-1].tolist(),
@@ -190,10 +190,9 @@ class FleetPacks:
         """Return number and worst packs of each concern, and the number of packs with any."""
         concerns, attention = {}, silent | (rows["suspects"] > 0)
         for name, concern in CONCERNS.items():
-            sign = 1.0 if concern.is_low_bad else -1.0  # the worst values of the column become the smallest
-            column = sign * rows[concern.column]
-            beyond = alive & (column < sign * concern.limit)
-            listed = [[self._names[i], sign * value] for i, value in _extremes(column, alive & np.isfinite(column))]
+            column = rows[concern.column]
+            beyond = alive & (column < concern.limit)
+            listed = [[self._names[i], value] for i, value in _extremes(column, alive & np.isfinite(column))]
             concerns[name] = {"count": int(beyond.sum()), "limit": concern.limit, "packs": listed}
             attention |= beyond
         suspected = _extremes(-np.bitwise_count(rows["suspects"]).astype("f8"), rows["suspects"] > 0)

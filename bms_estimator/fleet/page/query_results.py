@@ -8,7 +8,7 @@ import duckdb
 from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.model.errors import UserError
 
-PAGE_QUERIES = ("soh", "failing", "outliers", "honest")
+PAGE_QUERIES = ("failing", "soh", "outliers", "honest")
 """Names of the queries on the page."""
 MAX_ROWS = 20
 """Maximum number of rows of a result."""
@@ -22,7 +22,7 @@ def answer(folder: Path, name: str) -> dict[str, Any]:
         name: Name of the query.
 
     Returns:
-        ``columns``, the first ``rows``, and their number (``count``); or the reason why they are missing (``reason``).
+        ``columns``, the first ``rows``, their number (``count``), and ``notes``; or the reason why they are missing (``reason``).
     """
     try:
         result = run_query(folder, name)
@@ -30,4 +30,4 @@ def answer(folder: Path, name: str) -> dict[str, Any]:
         return {"reason": str(error)}
     # Rows of ``soh`` for a type have no pack; the page shows only these rows.
     rows = [row for row in result.rows if name != "soh" or row[result.columns.index("pack")] is None]
-    return {"columns": result.columns, "rows": rows[:MAX_ROWS], "count": len(rows)}
+    return {"columns": result.columns, "rows": rows[:MAX_ROWS], "count": len(rows), "notes": result.notes}

@@ -6,6 +6,7 @@ A row is acknowledged as soon as its file is on disk. The server redelivers it u
 import asyncio
 import contextlib
 import fcntl
+import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -21,14 +22,18 @@ from nats.js.api import AckPolicy, ConsumerConfig
 from nats.js.errors import NotFoundError
 from pydantic import ValidationError
 
-from bms_estimator.edge.subjects import HOURS_STREAM
-from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.edge.subjects import HOURS_STREAM, PACKS_BUCKET
+from bms_estimator.fleet.hour_row import HOUR_S, Hour
+from bms_estimator.fleet.nats.bucket_reader import BucketReader
+from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.queries.parquet_files import (
     QUARANTINE_FOLDER,
     compact,
     days_to_compact,
+    read_packs,
     remove_unfinished,
     write,
+    write_packs,
 )
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import TemporaryError, UserError
@@ -45,6 +50,8 @@ FETCH_S = 0.5
 """Timeout of a request when no row is waiting [s]."""
 COMPACT_S = 600.0
 """Interval between two merges of the files of a day [s]."""
+TABLE_S = 60.0
+"""Interval between two reads of the table of packs [s]."""
 RETRY_S = 10.0
 """Retry interval after an error of disk or server [s]."""
 
@@ -70,6 +77,12 @@ class Collector:
         self._waiting: list[tuple[Msg, Hour]] = []
         self._first_waiting_s = self._clock.monotonic()  # arrival of the oldest waiting row
         self._compacted_s = self._first_waiting_s  # last merge of files
+        self._table_read_s = -math.inf
+        self._table = BucketReader(nc, PACKS_BUCKET)
+        self._listed, self._stored_packs = (
+            dict[str, int](),
+            read_packs(folder),
+        )  # packs in the table, and in ``PACKS_FILE``
         self.counters = Counter[str]()
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -83,6 +96,9 @@ class Collector:
             now_s = self._clock.monotonic()
             if len(self._waiting) >= MAX_ROWS or (self._waiting and now_s - self._first_waiting_s >= self._period_s):
                 await self._save(stop)
+            if now_s - self._table_read_s >= TABLE_S:
+                self._table_read_s = now_s
+                await self._save_table()
             if now_s - self._compacted_s >= COMPACT_S:
                 self._compacted_s = now_s
                 await asyncio.to_thread(compact_days, self._folder, self._clock.wall())
@@ -155,6 +171,24 @@ class Collector:
             await self._nc.flush()
         except (nats.errors.Error, TimeoutError) as error:  # the rows are delivered again; queries drop duplicates
             await self._wait_after_error("written rows could not be acknowledged", error, stop)
+
+    async def _save_table(self) -> None:
+        """Read the changes of the table of packs, and write the packs to a file. After an error the next call tries again."""
+        now_hour = int(self._clock.wall() // HOUR_S)
+
+        def set_row(pack: str, row: bytes | None) -> None:
+            if row is None:
+                self._listed.pop(pack, None)
+            else:
+                self._listed.setdefault(pack, self._stored_packs.get(pack, now_hour))
+
+        try:
+            await self._table.read(set_row)
+            if self._listed != self._stored_packs:
+                await asyncio.to_thread(write_packs, self._folder, self._listed)
+                self._stored_packs = dict(self._listed)
+        except (StreamError, nats.errors.Error, OSError) as error:
+            log.warning("the table of packs cannot be stored", reason=str(error))
 
     async def _wait_after_error(self, event: str, error: Exception, stop: asyncio.Event) -> None:
         """Count and log an error, and wait before the next attempt."""

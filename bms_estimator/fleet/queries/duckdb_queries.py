@@ -7,8 +7,8 @@ import contextlib
 import math
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
@@ -21,6 +21,7 @@ from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.queries.parquet_files import (
     DAY_FOLDER_PREFIX,
     MERGED_PREFIX,
+    PACKS_FILE,
     QUARANTINE_FOLDER,
     SCHEMA,
     VALID_ROWS,
@@ -39,6 +40,8 @@ CHARGE_ERROR = 0.002
 ``kernels.kalman_filter.records.Noise``."""
 READ_ONLY_STATEMENTS = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 """Types of statements that a user's SQL query may contain."""
+MAX_ROW_AGE_H = 3
+"""Age of the newest row from which on a warning asks whether the collector runs [h]."""
 EXPECTED_FALSE_REPORTS = 0.1
 """Expected number of packs of the fleet that are reported by chance, for each quantity."""
 MIN_STDS = 3.0
@@ -55,17 +58,15 @@ class Query(NamedTuple):
 
 
 QUERIES = {
-    "soh": Query(("days", "packs", "fits"), "capacity trend a year with its band, of each type and pack"),
+    "soh": Query(("days", "packs", "points", "fits"), "capacity trend a year with its band, of each type and pack"),
     "outliers": Query(("days", "packs"), "packs whose capacity or R_s deviates from their type"),
-    "failing": Query(("days", "packs", "fits"), "packs that will soon reach a limit, or have recent input faults"),
-    "honest": Query(("days", "packs"), "how often the SOC was within 2 std, compared with later estimates"),
-    "silent": Query(("days", "packs"), "packs without recent hours"),
-    "weak-cells": Query(("days", "packs"), "packs in which one series cell is below the others in most recent hours"),
-    "imbalance": Query(("days", "packs"), "packs whose cells differ in SOC, and the trend of the difference"),
-    "self-discharge": Query(
-        ("days", "packs"), "cells that discharge themselves, for example by an internal short, with their current"
+    "failing": Query(
+        ("days", "packs", "points", "fits"),
+        "packs with a faulty cell, that will soon reach a limit, or that have recent input faults",
     ),
-    "clocks": Query((), "packs whose edge's clock is wrong, so that their hours are quarantined"),
+    "honest": Query(("days", "packs"), "how often the SOC was within 2 std, compared with later estimates"),
+    "silent": Query(("days", "packs"), "packs of which nothing has arrived recently, or ever"),
+    "clocks": Query(("server_errors",), "wrong clocks of edges, whose hours may be quarantined, and of the server"),
 }
 
 
@@ -82,22 +83,28 @@ class Limits:
     r_s_fresh_s: float = 86_400.0
     """Maximum time since R_s was last identified [s]; older values are not used."""
     min_days: int = 7
-    """Queries soh, failing, imbalance: minimum number of days in a trend."""
+    """Queries soh, failing: minimum number of days in a trend."""
     min_packs: int = 5
     """Query outliers: minimum number of packs with a valid value that define the reference of their type."""
     min_spread: float = 0.01
     """Query outliers: lower bound of the relative standard deviation between packs of a type."""
     recent_days: int = 3
     """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault.
-    Queries weak-cells, imbalance and self-discharge use the rows of these days."""
-    weak_cell_soc: float = 0.05
-    """Query weak-cells: minimum mean deviation of the weakest cell below the mean of the cells [SOC]."""
-    imbalance_soc: float = 0.05
-    """Query imbalance: minimum difference between the highest and the lowest cell [SOC]."""
+    Faulty cells are those of more than half of the hours of these days."""
+    weak_cell_soc: float = 0.03
+    """Query failing: SOC below the mean of the cells by which a cell lies at least, three standard deviations being subtracted."""
+    small_cell_ratio: float = 0.9
+    """Query failing: upper limit of the capacity of a cell, relative to the median of the cells."""
+    resistive_cell_ratio: float = 1.25
+    """Query failing: lower limit of the resistance of a cell, relative to the median; two standard deviations are subtracted."""
     self_discharge_c: float = MIN_SHORT_C
-    """Query self-discharge: minimum self-discharge of a cell above the median cell, as a C-rate [1/h]."""
+    """Query failing: minimum self-discharge of a cell above the median cell, as a C-rate [1/h]."""
     silent_hours: int = 2
-    """Query silent: maximum age of the last summary [h]. The newest summary of a live pack is of the previous hour."""
+    """Query silent: maximum time since the last summary arrived [h]. The summary of an hour arrives in the next hour."""
+    min_server_packs: int = 3
+    """Query clocks: minimum number of packs with a clock error in one hour that proves a wrong clock of the server."""
+    behind_h: int = 24
+    """Query clocks: minimum time by which an edge's clock is constantly behind the server's [h]."""
     max_packs: int = 10_000
     """Query honest: maximum number of packs, selected by a hash of their name."""
     min_seen_s: float = 3590.0
@@ -115,6 +122,8 @@ class Answer:
 
     columns: tuple[str, ...]
     rows: list[tuple[Any, ...]]
+    notes: tuple[str, ...] = ()
+    """Warnings, for example of a wrong clock."""
 
     @property
     def records(self) -> list[dict[str, Any]]:
@@ -122,7 +131,14 @@ class Answer:
         return [dict(zip(self.columns, row, strict=True)) for row in self.rows]
 
 
-def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limits = LIMITS) -> Answer:
+def run_query(
+    folder: Path,
+    name: str,
+    *,
+    days: int | None = None,
+    limits: Limits = LIMITS,
+    wall: Callable[[], float] = time.time,
+) -> Answer:
     """Run a named query.
 
     Args:
@@ -130,20 +146,29 @@ def run_query(folder: Path, name: str, *, days: int | None = None, limits: Limit
         name: Name in ``QUERIES``.
         days: Number of last days (UTC) that are used; None: all.
         limits: Parameters of the query.
+        wall: Wall clock of this machine [s since 1970].
 
     Raises:
         UserError: The query, the folder or its rows do not exist, or a file is damaged.
     """
     if name not in QUERIES:
         raise UserError(f"{name}: no such query; there are {', '.join(QUERIES)}, and sql 'SELECT ...'")
-    with open_database(folder, days) as database:
-        (now_hour,) = database.execute("SELECT getvariable('now_hour')").fetchone() or (0,)
-        parameters = vars(limits) | _parameters(int(now_hour))
+    with open_database(folder, days, wall=wall) as (database, present):
+        parameters = vars(limits) | _parameters(present)
         for table in QUERIES[name].tables:
             _run(database, _sql(table), parameters)
             if table == "packs":  # the limit depends on the number of packs
                 parameters["stds"] = _reporting_limit_stds(database)
-        return _answer(_run(database, _sql(name), parameters))
+        answer = _answer(_run(database, _sql(name), parameters), present.notes)
+        if name == "soh" and not answer.rows:
+            days = "SELECT count(DISTINCT pack), coalesce(max(n), 0) FROM (SELECT pack, count(*) AS n FROM points WHERE quantity = 'capacity' GROUP BY pack)"
+            ((packs, most),) = database.execute(days).fetchall()
+            text = (
+                f"no trend yet: it needs {limits.min_days} days on which the capacity of a pack was measured, by a large change of its SOC; "
+                f"so far {packs} packs have such days, at most {most}"
+            )
+            answer = replace(answer, notes=(*answer.notes, text))
+        return answer
 
 
 def select(folder: Path, query: str, *, days: int | None = None) -> Answer:
@@ -152,31 +177,57 @@ def select(folder: Path, query: str, *, days: int | None = None) -> Answer:
     Raises:
         UserError: The folder or its rows do not exist, a file is damaged, or the query is invalid.
     """
-    with open_database(folder, days) as database:
+    with open_database(folder, days) as (database, present):
         database.execute("SET allowed_directories = $folders", {"folders": [str(folder)]})
         database.execute("SET enable_external_access = false")
         database.execute("SET lock_configuration = true")
         try:
             if any(each.type not in READ_ONLY_STATEMENTS for each in database.extract_statements(query)):
                 raise UserError("sql: only SELECT and DESCRIBE are allowed")
-            return _answer(database.execute(query))
+            return _answer(database.execute(query), present.notes)
         except duckdb.Error as error:
             raise UserError(f"sql: {error}") from error
+
+
+def server_errors(folder: Path, *, wall: Callable[[], float]) -> tuple[list[int], int]:
+    """Return the hours in which rows arrived while the server's clock was wrong, and the present hour [hours since 1970].
+
+    Args:
+        folder: Folder of the Parquet files.
+        wall: Wall clock of this machine [s since 1970].
+
+    Raises:
+        UserError: The folder does not exist, is empty, or has a damaged file.
+    """
+    with open_database(folder, wall=wall) as (database, present):
+        _run(database, _sql("server_errors"), vars(LIMITS) | _parameters(present))
+        rows = database.execute("SELECT received_hour FROM server_errors").fetchall()
+        return [hour for (hour,) in rows], present.asked_hour
+
+
+class Present(NamedTuple):
+    """Present time of the queries."""
+
+    asked_hour: int
+    """Present hour of this machine, or of the servers if this machine's clock is behind [hours since 1970]."""
+    now_hour: int
+    """Last complete hour on the server's clock when the newest row arrived [hours since 1970]."""
+    notes: tuple[str, ...] = ()
+    """Wrong clocks."""
 
 
 @contextlib.contextmanager
 def open_database(
     folder: Path, days: int | None = None, *, wall: Callable[[], float] = time.time
-) -> Iterator[duckdb.DuckDBPyConnection]:
+) -> Iterator[tuple[duckdb.DuckDBPyConnection, Present]]:
     """Open a database with the view ``hours``, which has one row for each hour of each pack, and the view ``quarantined``.
 
-    The variable ``now_hour`` is the last complete hour on the server's clock when the newest row arrived. The days end with
-    this hour.
+    The days end with ``Present.now_hour``.
 
     Args:
         folder: Folder of the Parquet files.
         days: Number of last days (UTC) that are used; None: all.
-        wall: Wall clock [s since 1970], used only if all rows are from workers that did not record the server's time.
+        wall: Wall clock of this machine [s since 1970].
 
     Raises:
         UserError: The folder does not exist, is empty, or has a damaged file.
@@ -184,11 +235,17 @@ def open_database(
     files, quarantined = _files(folder), _files_by_day(folder / QUARANTINE_FOLDER)
     with duckdb.connect() as database, _user_errors(folder):
         database.execute("SET TimeZone = 'UTC'")
-        now_hour = _present_hour(database, [*files.values(), *quarantined.values()], int(wall() // HOUR_S))
-        database.execute(f"SET VARIABLE now_hour = {now_hour}")
-        _create_hours_view(database, _last_days(files, now_hour, days))
-        _create_quarantined_view(database, _last_days(quarantined, now_hour, days))
-        yield database
+        names = [str(file) for day_files in (*files.values(), *quarantined.values()) for file in day_files]
+        present = find_present(database, names, int(wall() // HOUR_S))
+        database.execute(f"SET VARIABLE now_hour = {present.now_hour}")
+        last = _day_name(present.now_hour + 1)
+        first = "" if days is None else _day_name(present.now_hour - 24 * (days - 1))
+        valid_files = {day: files for day, files in files.items() if first <= day.name <= last}
+        _create_hours_view(database, valid_files)
+        # without an end, because a server whose clock was ahead received the rows of the last days
+        _create_quarantined_view(database, {day: files for day, files in quarantined.items() if first <= day.name})
+        _create_listed_packs(database, folder)
+        yield database, present
 
 
 @contextlib.contextmanager
@@ -224,28 +281,54 @@ def _files_by_day(folder: Path) -> dict[Path, list[Path]]:
     return {day: files for day, files in by_day.items() if files}
 
 
-def _present_hour(database: duckdb.DuckDBPyConnection, files: Iterable[list[Path]], wall_hour: int) -> int:
-    """Return the last complete hour on the server's clock when the newest row arrived.
+def find_present(database: duckdb.DuckDBPyConnection, names: list[str], wall_hour: int) -> Present:
+    """Return the present time. Usually only the statistics in the files are read.
 
-    If no row has the server's time, return the newest hour of a row that is not after ``wall_hour``, or ``wall_hour`` without
-    such a row. Only the statistics in the files are read.
+    A row that arrived after the present by the server's clock shows that a clock is wrong. It is this machine's clock if most
+    edges also are after the present; otherwise it is the server's, and the row's arrival is not used.
+
+    Args:
+        database: Database.
+        names: Files.
+        wall_hour: Present hour on this machine's clock [hours since 1970].
     """
-    names = [str(file) for day_files in files for file in day_files]
     statistics = """
-        SELECT max(latest) FILTER (path_in_schema = 'received_hour') - 1,
+        SELECT max(latest) FILTER (path_in_schema = 'received_hour'),
             max(latest) FILTER (path_in_schema = 'hour' AND latest <= $wall_hour)
         FROM (SELECT path_in_schema, stats_max_value::BIGINT AS latest FROM parquet_metadata($names)
             WHERE path_in_schema IN ('hour', 'received_hour'))
     """
-    found = database.execute(statistics, {"names": names, "wall_hour": wall_hour}).fetchone() or ()
-    return next((int(hour) for hour in found if hour is not None), wall_hour)
+    ((received, hour),) = database.execute(statistics, {"names": names, "wall_hour": wall_hour}).fetchall()
+    notes: tuple[str, ...] = ()
+    if received is not None and received > wall_hour + 1:
+        later = """
+            WITH arrivals AS (
+                SELECT
+                    max(received_hour) FILTER (received_hour <= $limit) AS known, max(received_hour) AS last,
+                    count(*) FILTER (received_hour > $limit) AS later,
+                    bool_or(received_hour > $limit AND hour > $limit AND clock_error_s IS NULL) AS agrees
+                FROM read_parquet($names, union_by_name = true, hive_partitioning = false) GROUP BY pack
+            )
+            SELECT max(known), sum(later), count(*) FILTER (later > 0), count(*) FILTER (agrees), quantile_disc(last, 0.5), max(last)
+            FROM arrivals
+        """
+        arrivals = database.execute(later, {"names": names, "limit": wall_hour + 1}).fetchall()
+        ((received, rows, packs, agreeing, median, latest),) = arrivals
+        if 2 * agreeing > packs:
+            text = f"the clock of this machine is {median - wall_hour} h behind those of the server and of {agreeing} edges: set it"
+            return Present(median, median - 1, (text,))
+        text = f"{rows} rows of {packs} packs arrived in the future by the server's clock, up to {_time(latest)}: this arrival is not used"
+        notes = (
+            f"{text}; set the clocks of its nodes; `fleet ask clocks` lists the hours, `fleet repair` repairs the files",
+        )
+    now_hour = next((int(each) for each in (received and received - 1, hour) if each is not None), wall_hour)
+    if wall_hour - now_hour > MAX_ROW_AGE_H:
+        notes += (f"the newest row arrived at {_time(now_hour + 1)}: do workers and `fleet collect` run?",)
+    return Present(wall_hour, now_hour, notes)
 
 
-def _last_days(by_day: Mapping[Path, list[Path]], now_hour: int, days: int | None) -> dict[Path, list[Path]]:
-    """Return the files of the days up to the hour after ``now_hour``: of the last ``days`` days, or of all days without this limit."""
-    last = _day_name(now_hour + 1)
-    first = "" if days is None else _day_name(now_hour - 24 * (days - 1))
-    return {day: files for day, files in by_day.items() if first <= day.name <= last}
+def _time(hour: int) -> str:
+    return f"{datetime.fromtimestamp(hour * HOUR_S, UTC):%Y-%m-%d %H:%M} UTC"
 
 
 def _day_name(hour: int) -> str:
@@ -258,6 +341,15 @@ def _create_quarantined_view(database: duckdb.DuckDBPyConnection, files: Mapping
     names = [str(file) for day_files in files.values() for file in day_files]
     read = database.read_parquet(names, union_by_name=True, hive_partitioning=False) if names else None
     (database.table("all_columns") if read is None else read).create_view("quarantined")
+
+
+def _create_listed_packs(database: duckdb.DuckDBPyConnection, folder: Path) -> None:
+    """Create the view ``listed``: the packs in the server's table, as the collector has stored it. Without it, the view is empty."""
+    file = folder / PACKS_FILE
+    if file.exists():
+        database.read_parquet(str(file)).create_view("listed")
+    else:
+        database.execute("CREATE TEMP VIEW listed AS SELECT ''::VARCHAR AS pack, 0::BIGINT AS listed_hour WHERE false")
 
 
 def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
@@ -279,14 +371,16 @@ def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path,
             )
         (database.table("all_columns") if read is None else read).create_view(name)
     database.execute("CREATE TEMP VIEW rows AS SELECT * FROM all_columns UNION ALL BY NAME SELECT * FROM unmerged_rows")
+    database.execute("CREATE TEMP VIEW stored AS SELECT * FROM rows UNION ALL BY NAME SELECT * FROM merged_rows")
     database.execute(f"CREATE TEMP VIEW valid_rows AS {VALID_ROWS}")
     database.execute(_sql("hours"))
 
 
-def _parameters(now_hour: int) -> dict[str, Any]:
+def _parameters(present: Present) -> dict[str, Any]:
     return {
-        "now_hour": now_hour,
-        "today": now_hour // 24,
+        "asked_hour": present.asked_hour,
+        "now_hour": present.now_hour,
+        "today": present.now_hour // 24,
         "aged_soc": AGED_SOC,
         "charge_error": CHARGE_ERROR,
         "suspect_bits": [int(suspect) for suspect in InputFault],
@@ -309,9 +403,9 @@ def _run(database: duckdb.DuckDBPyConnection, query: str, parameters: Mapping[st
     return database.execute(query, {name: parameters[name] for name in set(re.findall(r"\$(\w+)", query))})
 
 
-def _answer(result: duckdb.DuckDBPyConnection) -> Answer:
+def _answer(result: duckdb.DuckDBPyConnection, notes: tuple[str, ...]) -> Answer:
     columns = tuple(column[0] for column in result.description or ())
-    return Answer(columns, [tuple(_plain(value) for value in row) for row in result.fetchall()])
+    return Answer(columns, [tuple(_plain(value) for value in row) for row in result.fetchall()], notes)
 
 
 def _plain(value: Any) -> Any:

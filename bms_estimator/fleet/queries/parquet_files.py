@@ -6,7 +6,7 @@ row with the largest revision is valid. The module needs pyarrow and duckdb.
 
 import os
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, date, datetime
 from pathlib import Path
 
@@ -26,6 +26,8 @@ MERGED_PREFIX = "day-"
 QUARANTINE_FOLDER = "_quarantine"
 """Folder of the rows of packs with a wrong clock, in folders of the days on the server's clock. Readers of a folder of
 Parquet files, such as pyarrow and Spark, skip names that begin with ``_``."""
+PACKS_FILE = "_packs.parquet"
+"""File with the packs in the server's table."""
 UNFINISHED_SUFFIX = ".part"
 """Suffix of the name of an unfinished file."""
 MAX_FILES_PER_DAY = 48
@@ -94,6 +96,26 @@ def _write_days(folder: Path, table: pa.Table, hours: pa.ChunkedArray) -> list[P
     """Write rows to a new file for each day of ``hours``, which has one hour for each row."""
     days = pc.divide(hours, 24)
     return [_write_day(folder, int(day.as_py()), table.filter(pc.equal(days, day))) for day in pc.unique(days)]
+
+
+def write_packs(folder: Path, listed: Mapping[str, int]) -> None:
+    """Write the packs in the server's table, each with the hour since which its row is in force [hours since 1970].
+
+    Raises:
+        OSError: The file cannot be written; the existing one remains complete.
+    """
+    columns = {"pack": pa.array(listed.keys(), pa.string()), "listed_hour": pa.array(listed.values(), pa.int64())}
+    path = folder / PACKS_FILE
+    unfinished = unfinished_name(path)
+    pq.write_table(pa.table(columns), unfinished, compression="zstd")
+    finish(unfinished, path)
+
+
+def read_packs(folder: Path) -> dict[str, int]:
+    """Return the packs that ``write_packs`` has written; empty without the file."""
+    path = folder / PACKS_FILE
+    columns = pq.read_table(path, partitioning=None).to_pydict() if path.exists() else {"pack": [], "listed_hour": []}
+    return dict(zip(columns["pack"], columns["listed_hour"], strict=True))
 
 
 def day_folder(folder: Path, day: date) -> Path:
@@ -193,8 +215,9 @@ def compact(day: Path) -> Path:
 
 def remove_unfinished(folder: Path) -> None:
     """Remove unfinished files of a killed process. No other process may write to ``folder`` meanwhile."""
-    for file in folder.glob(f"{DAY_FOLDER_PREFIX}*/.*{UNFINISHED_SUFFIX}"):
-        file.unlink(missing_ok=True)
+    for pattern in (f".*{UNFINISHED_SUFFIX}", f"{DAY_FOLDER_PREFIX}*/.*{UNFINISHED_SUFFIX}"):
+        for file in folder.glob(pattern):
+            file.unlink(missing_ok=True)
 
 
 def complete_files(day: Path) -> list[Path]:

@@ -13,7 +13,7 @@ Private keys need not be copied: other nodes need only ``claims.json``.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import datetime
 from pathlib import Path
 
@@ -74,12 +74,19 @@ def read_accounts(folder: Path) -> Accounts:
 
 
 def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: datetime | None = None) -> str:
-    """Return a token that an edge sends as MQTT password.
+    """Return the token of one edge. Arguments and errors are those of ``edge_tokens``."""
+    return edge_tokens(folder, tenant, [pack], now, expires)[pack]
+
+
+def edge_tokens(
+    folder: Path, tenant: str, packs: Iterable[str], now: datetime, expires: datetime | None = None
+) -> dict[str, str]:
+    """Return by pack the tokens that edges send as MQTT password.
 
     Args:
         folder: Folder of the keys.
-        tenant: Tenant of the pack.
-        pack: Pack whose blocks the token allows to send.
+        tenant: Tenant of the packs.
+        packs: Packs whose blocks the tokens allow to send.
         now: Issue time; tokens issued before a configured time can be revoked.
         expires: Expiry time; None: never.
 
@@ -91,7 +98,22 @@ def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: dat
         tenants = sorted(path.parent.name for path in folder.glob("*/account.nk"))
         hint = f"there are {', '.join(tenants)}" if tenants else "start `fleet serve` with it first"
         raise UserError(f"{folder}: no keys of a tenant {tenant}: {hint}")
-    return jwt_claims.user(_read_key(signer), _read_key(account).public, Role.EDGE, pack, now, expires)
+    key, public = _read_key(signer), _read_key(account).public
+    return {pack: jwt_claims.user(key, public, Role.EDGE, pack, now, expires) for pack in packs}
+
+
+def write_tokens(path: Path, tokens: Mapping[str, str]) -> None:
+    """Write tokens, readable by their owner only: to a CSV file if the name ends in .csv, otherwise to files PACK.token of a folder.
+
+    Raises:
+        TemporaryError: A file cannot be written.
+    """
+    if path.suffix == ".csv":
+        rows = "".join(f"{pack},{token}\n" for pack, token in tokens.items())
+        _write(path, f"pack,token\n{rows}".encode())
+        return
+    for pack, token in tokens.items():
+        _write(path / f"{pack}.token", token.encode())
 
 
 def credentials_file(folder: Path, tenant: str, role: Role) -> Path:

@@ -34,7 +34,8 @@ def sizes_of(settings: FleetSettings, tenant: TenantSettings) -> StreamSizes:
     """Return the sizes of a tenant's streams."""
     server = settings.server
     cells = server.cells if tenant.cells is None else tenant.cells
-    return stream_sizes(tenant.packs or server.packs, tenant.outage_days or server.outage_days, cells)
+    outage_days = tenant.outage_days or server.outage_days
+    return stream_sizes(tenant.packs or server.packs, outage_days, cells, server.block_s)
 
 
 def check_disk_space(settings: FleetSettings, folder: Path, available: int, copies_per_node: float) -> None:

@@ -25,8 +25,7 @@ from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.child_process import ends_with_us
-from bms_estimator.process.nats_server_program import find_server
+from bms_estimator.process.child_process import ends_with_us, find_server
 from bms_estimator.process.private_file import write_private
 
 log = structlog.get_logger(__name__)

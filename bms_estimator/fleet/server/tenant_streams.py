@@ -50,6 +50,7 @@ async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant
             raw_age_s=86_400.0 * (tenant.outage_days or server.outage_days),
             states_bytes=sizes.states,
             history_bytes=sizes.history,
+            max_pack_blocks=sizes.pack_blocks,
         )
     except NoAnswerError:
         raise

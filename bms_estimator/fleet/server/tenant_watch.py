@@ -1,4 +1,4 @@
-"""Watch over one tenant: heartbeats of its workers, its streams, and unsaved blocks."""
+"""Watch over one tenant: heartbeats of its workers, its streams, unsaved blocks, and silent packs."""
 
 import asyncio
 import contextlib
@@ -17,13 +17,15 @@ from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.metrics.states import StreamState, TenantState
 from bms_estimator.fleet.nats.backlog import undelivered_messages
 from bms_estimator.fleet.nats.connection import close
+from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S
-from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
+from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
+from bms_estimator.fleet.server.arrival_watch import ArrivalWatch
 from bms_estimator.fleet.server.local_client import connect
 from bms_estimator.fleet.server.nats_config import Node
 
-UNSAVED_CHECK_S = 60.0
-"""Interval between two checks how much of the stream is unsaved [s]."""
+CHECK_S = 60.0
+"""Interval between two checks for unsaved blocks and silent packs [s]."""
 LAG_WINDOW_S = 60.0
 """Time over which the largest lag is found [s], at least the usual interval of scrapes."""
 RETRY_S = 1.0
@@ -46,6 +48,7 @@ class TenantWatch:
         self._workers = FleetWorkers(node.partitions, LAG_WINDOW_S)
         self._nc: Client | None = None
         self._unsaved_share: float | None = None
+        self._silent: int | None = None
 
     async def run(self) -> None:
         """Receive heartbeats, and log a warning while more than half of the stream is unsaved, until cancelled."""
@@ -54,7 +57,7 @@ class TenantWatch:
             try:
                 await self._watch_until_disconnected()
                 last_reason = ""
-            except (NatsError, OSError) as error:
+            except (NatsError, OSError, StreamError) as error:
                 if str(error) != last_reason:
                     log.warning("the tenant cannot be watched", tenant=self._name, reason=str(error))
                 last_reason = str(error)
@@ -83,7 +86,7 @@ class TenantWatch:
             )
             for info in infos
         }
-        return TenantState(heartbeats, undelivered, streams, self._unsaved_share)
+        return TenantState(heartbeats, undelivered, streams, self._unsaved_share, self._silent)
 
     async def _watch_until_disconnected(self) -> None:
         """Connect, and watch until the connection has ended."""
@@ -95,22 +98,27 @@ class TenantWatch:
         self._nc = nc = await connect(self._node, self._credentials_file, on_close)
         try:
             await nc.subscribe(subjects.worker(), cb=self._receive)
-            await self._check_unsaved(nc, closed)
+            await self._check_periodically(nc, closed)
         finally:
-            self._nc, self._unsaved_share = None, None
+            self._nc = self._unsaved_share = self._silent = None
             self._workers.clear()
             await close(nc)
 
-    async def _check_unsaved(self, nc: Client, closed: asyncio.Event) -> None:
-        """Compute the unsaved share periodically until the connection has ended."""
+    async def _check_periodically(self, nc: Client, closed: asyncio.Event) -> None:
+        """Compute the unsaved share and the silent packs periodically until the connection has ended."""
+        arrivals = ArrivalWatch(nc)
         while not closed.is_set():
-            self._unsaved_share = await unsaved_share(nc, range(self._node.partitions))
-            if warning := unsaved_warning(self._unsaved_share):
+            self._silent = await arrivals.silent_packs(time.monotonic())
+            unsaved = await unsaved_blocks(nc, range(self._node.partitions))
+            self._unsaved_share = unsaved.share
+            if unsaved.warning:
                 log.warning(
-                    "the stream fills with blocks that no checkpoint includes", tenant=self._name, reason=warning
+                    "the stream fills with blocks that no checkpoint includes",
+                    tenant=self._name,
+                    reason=unsaved.warning,
                 )
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(UNSAVED_CHECK_S):
+                async with asyncio.timeout(CHECK_S):
                     await closed.wait()
 
     async def _receive(self, message: Msg) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.identity import without_observer
+from bms_estimator.checkpoint.arrays_file import without_observer
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
@@ -40,9 +40,8 @@ from bms_estimator.telemetry.cells import make_cells_payload
 from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.state import make_state_payload
-from bms_estimator.telemetry.weakest_cell import estimate_fields
+from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 
 MAX_WALL_S = 2.0**34
 """Latest plausible wall clock [s since 1970]: the year 2514."""

@@ -27,6 +27,10 @@ __all__ = ["HOUR_S", "HOUR_SUMS", "Hour", "add", "begin", "hour_of", "row"]
 REST_C = 0.01
 """Maximum current of a resting pack, as a C-rate [1/h]."""
 
+SIGNIFICANT_STDS = 3.0
+"""Number of std by which the deviation of a cell is reduced in the choice of the weakest cell and of that with the highest
+resistance."""
+
 Sums = NDArray[np.void]
 """Shape (1,), dtype ``HOUR_SUMS``; all zero before the first block."""
 
@@ -76,12 +80,21 @@ def cell_fields(cells: CellDeviations | None) -> dict[str, float]:
     """Return the fields of a row about single cells; empty without an estimate."""
     if cells is None:
         return {}
+    weak = int(np.argmin(cells.soc_deviation + SIGNIFICANT_STDS * cells.soc_deviation_std))
+    small = int(np.argmin(cells.capacity_ratio))
+    resistive = int(np.argmax(cells.resistance_ratio - SIGNIFICANT_STDS * cells.resistance_ratio_std))
     leaking = int(np.argmax(cells.self_discharge_a / cells.self_discharge_std_a))
     return {
-        "weakest_cell": cells.weakest + 1,
-        "weakest_cell_soc_deviation": float(cells.soc_deviation[cells.weakest]),
-        "weakest_cell_resistance_ratio": float(cells.resistance_ratio[cells.weakest]),
+        "weakest_cell": weak + 1,
+        "weakest_cell_soc_deviation": float(cells.soc_deviation[weak]),
+        "weakest_cell_soc_deviation_std": float(cells.soc_deviation_std[weak]),
+        "weakest_cell_resistance_ratio": float(cells.resistance_ratio[weak]),
         "cell_soc_spread": float(np.ptp(cells.soc_deviation)),
+        "smallest_cell": small + 1,
+        "smallest_cell_capacity_ratio": float(cells.capacity_ratio[small]),
+        "resistive_cell": resistive + 1,
+        "resistive_cell_ratio": float(cells.resistance_ratio[resistive]),
+        "resistive_cell_ratio_std": float(cells.resistance_ratio_std[resistive]),
         "self_discharge_cell": leaking + 1,
         "self_discharge_a": float(cells.self_discharge_a[leaking]),
         "self_discharge_std_a": float(cells.self_discharge_std_a[leaking]),

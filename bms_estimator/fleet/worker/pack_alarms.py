@@ -11,29 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.fleet.packs.alarm_definitions import AlarmDefinitions
-from bms_estimator.fleet.packs.pack_type import PackType
+from bms_estimator.fleet.packs.pack_type import AlarmDefinitions, PackType
 from bms_estimator.fleet.worker.block_result import AlarmMessage
 from bms_estimator.kernels import alarms as kernel
 from bms_estimator.kernels.alarms import CHANGE, COUNTS, NAMES, PART, SAMPLE_ALARMS
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.events import Event, EventText, fit_event, input_fault_events, soc_events, watch_event
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock, SampleStatus
+from bms_estimator.telemetry.alarms.alarm_list import LOSS_TEXTS
 from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, find_unknown
 from bms_estimator.telemetry.alarms.evaluator import SENSOR_SUSPECTS, WRONG_CLOCK_TEXT
 from bms_estimator.telemetry.alarms.inputs import QUANTITIES
-from bms_estimator.telemetry.alarms.measured_values import has_bit
+from bms_estimator.telemetry.alarms.measured_values import has_bit, summarize
 from bms_estimator.telemetry.alarms.message import AlarmMessage as AlarmContent
 from bms_estimator.telemetry.alarms.message import alarm_payload
-from bms_estimator.telemetry.alarms.sample_buffer import summarize
 from bms_estimator.telemetry.alarms.sensor_faults import PROBE_TEXT
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
-from bms_estimator.telemetry.alarms.unwatched import LOSS_TEXTS
 from bms_estimator.telemetry.cells import cell_faults
-from bms_estimator.telemetry.health import identifier_counters, last_anchor, suspicions
-from bms_estimator.telemetry.pack_model import last_change
+from bms_estimator.telemetry.health import identifier_counters, last_anchor, last_change, suspicions
 
 
 class PackAlarms:

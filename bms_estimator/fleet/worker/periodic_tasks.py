@@ -8,7 +8,7 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.connection import error_text
-from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share, unsaved_warning
+from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError
@@ -85,7 +85,7 @@ class UnsavedCheck:
         if not self._nc.is_connected:
             return
         try:
-            warning = unsaved_warning(await unsaved_share(self._nc, partitions))
+            warning = (await unsaved_blocks(self._nc, partitions)).warning
         except RETRYABLE_ERRORS as error:
             log.warning("the stream cannot be checked", reason=error_text(error))
             return

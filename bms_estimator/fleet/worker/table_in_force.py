@@ -9,7 +9,7 @@ from typing import Protocol
 
 from bms_estimator.fleet.packs.pack_type import PackType, PackTypes
 from bms_estimator.fleet.packs.table_change import PackSource, decode_change, encode_change
-from bms_estimator.model.fuel_cell import PackModel
+from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.pack import Settings
 
 PackLookup = Callable[[str], tuple[Settings, PackModel] | None]

@@ -94,7 +94,7 @@ def project_pack(m: Record, s: Record, p: Record, cutoff_v: float, peak_a: float
     for k in range(BRANCHES):
         m.x_a[k] = s.x_a[k] + x[X + k]
     m.bias_v = x[B_SLOW] + x[B_FAST]
-    m.soc_std = math.hypot(SOC_STD_FACTOR * s.soc_std, MIN_SOC_STD)
+    m.soc_std = math.sqrt((SOC_STD_FACTOR * s.soc_std) ** 2 + MIN_SOC_STD**2)
     m.weakest_std = p.cell_spread if p.series > 1.0 else 0.0
     m.capacity_std = CAPACITY_STD_FACTOR * math.sqrt(cov[LN_Q, LN_Q])
     m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_STD_J, s.temperature_c))

@@ -237,7 +237,7 @@ def empty_std(f: Record, ekf: Record, current_a: float, cutoff_v: float) -> floa
     """
     open_v = cutoff_v + overpotential(f, ekf, 0.0, current_a)
     left_soc = soc_from_ocv(open_v, ekf.ocv_v, ekf.ocv_slope_v) - soc_from_ocv(cutoff_v, ekf.ocv_v, ekf.ocv_slope_v)
-    return math.hypot(ekf.bias_soc * f.weak, left_soc)
+    return math.sqrt((ekf.bias_soc * f.weak) ** 2 + left_soc**2)
 
 
 @njit(cache=True)

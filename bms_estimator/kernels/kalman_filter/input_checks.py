@@ -293,7 +293,8 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
         error_soc = p.load_mean_c * min(dt_s, p.unmeasured_s) / 3600.0
     elif c.suspects & SIGN_OF_CURRENT:
         error_soc = 2.0 * counted_soc
-    f.soc_std = min(math.hypot(f.soc_std + error_soc, f.window.unknown_as / p.capacity_as), MAX_SOC_STD)
+    soc_std = math.sqrt((f.soc_std + error_soc) ** 2 + (f.window.unknown_as / p.capacity_as) ** 2)
+    f.soc_std = min(soc_std, MAX_SOC_STD)
     f.window.unknown_as = 0.0
     f.step.phase = UNHELD
     bits = unusable_input_bits(c, p)

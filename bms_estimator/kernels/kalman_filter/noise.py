@@ -75,7 +75,7 @@ def resistance_std(s: Record, p: Record) -> float:
     """Return the std of ln of the true over the file's resistances, larger without a temperature sensor."""
     if s.sensed:
         return p.r_std
-    return max(p.r_std, math.hypot(UNSENSED_R_STD, WARMED_R_STD * (s.temperature_c - REFERENCE_C)))
+    return max(p.r_std, math.sqrt(UNSENSED_R_STD**2 + (WARMED_R_STD * (s.temperature_c - REFERENCE_C)) ** 2))
 
 
 @njit(cache=True)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from bms_estimator.reports.html import render
+from bms_estimator.reports.report_page import render
 from bms_estimator.reports.thesis.report import Report
 from bms_estimator.reports.thesis.report_items import Figure, Item, Reproduction, Table, label, name
 

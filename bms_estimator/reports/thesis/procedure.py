@@ -23,9 +23,9 @@ from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mo
 from bms_estimator.calibration.ocv.points import pooled
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, relaxation_test
 from bms_estimator.calibration.ocv.table_fit import TableFit, fit_table
+from bms_estimator.calibration.thesis.adapt import printed_bounds
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
 from bms_estimator.calibration.thesis.prediction import Prediction, predict, soc_by_interpolation, static_elements
-from bms_estimator.calibration.thesis.printed_bounds import printed_bounds
 from bms_estimator.calibration.thesis.series_resistance import (
     SeriesResistance,
     SeriesResistanceFit,

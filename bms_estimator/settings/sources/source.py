@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import Field
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.model.suggestion import suggestion
+from bms_estimator.model.one_of import suggestion
 
 Name = Annotated[str, Field(min_length=1)]
 

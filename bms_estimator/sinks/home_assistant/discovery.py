@@ -6,12 +6,11 @@ from typing import Any, NamedTuple, get_args
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.health import FRESH_PERIODS
-from bms_estimator.model.payloads.info import Info
+from bms_estimator.model.payloads.snapshot import Info
 from bms_estimator.model.quantity import Entity
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.home_assistant import HomeAssistantSettings
-from bms_estimator.settings.mqtt import Command
+from bms_estimator.settings.mqtt import Command, HomeAssistantSettings
 from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.home_assistant.entities import (
     BATTERY,

@@ -5,7 +5,7 @@ a separate topic, on which they are rounded and published rarely (``entity_value
 """
 
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.info import Info
+from bms_estimator.model.payloads.snapshot import Info
 from bms_estimator.model.quantity import Entity, field_entities, raw_entity
 
 ESTIMATE = field_entities(Estimate, "all")

@@ -1,6 +1,12 @@
-"""Builder of MQTT messages from a snapshot and the state already published. Pure: no connection, no clock."""
+"""Builder of MQTT messages from a snapshot and the state already published. Pure: no connection, no clock.
+
+A value for Home Assistant is published if it has changed enough and its minimum interval has passed. Home Assistant's
+recorder writes a row for each published value. Therefore the number of values a minute is limited. If more entities
+change, those published longest ago come first.
+"""
 
 import json
+import math
 from collections.abc import Collection, Iterator, Mapping
 from functools import cache
 from typing import Any, NamedTuple
@@ -9,9 +15,10 @@ from bms_estimator.model.events import events
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.quantity import Entity
 from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.home_assistant import HomeAssistantSettings
+from bms_estimator.settings.mqtt import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import (
     VALUES,
     DiscoveryInputs,
@@ -19,8 +26,115 @@ from bms_estimator.sinks.home_assistant.discovery import (
     discovery,
     discovery_topic,
 )
-from bms_estimator.sinks.home_assistant.entity_values import EntityStates, values_to_publish
+from bms_estimator.sinks.home_assistant.entities import cell_key, entities
 from bms_estimator.sinks.mqtt.topics import schema
+
+MAX_ROWS_PER_MINUTE = 18
+"""Maximum number of published values of default-enabled entities in a minute. With two values of alarms, the recorder
+writes at most 20 rows a minute."""
+MINUTE_S = 60.0
+"""Length of the window for ``MAX_ROWS_PER_MINUTE`` [s]."""
+MESSAGE_INTERVAL_S = 5.0
+"""Minimum interval between two messages with values [s]."""
+HEARTBEAT_S = 10.0
+"""Interval at which unchanged values are repeated, so that they do not expire [s]."""
+
+
+class EntityStates(NamedTuple):
+    """Values published to Home Assistant, by key of the entity. Times are on a monotonic clock [s]."""
+
+    values: Mapping[str, float | None] = {}
+    changed_s: Mapping[str, float] = {}
+    """Time at which each value was published."""
+    published_s: float = -math.inf
+    """Time of the last message."""
+    rows_s: tuple[float, ...] = ()
+    """Publish time of each value that was counted against ``MAX_ROWS_PER_MINUTE`` in the last minute."""
+
+
+def values_to_publish(
+    published: EntityStates, snapshot: Snapshot, discovery: DiscoveryInputs, now_s: float, *, sign: float = 1.0
+) -> EntityStates:
+    """Return the values to publish; ``published`` itself if nothing changed enough.
+
+    Args:
+        published: Values published last.
+        snapshot: Snapshot with the current values.
+        discovery: Data that determine the entities.
+        now_s: Monotonic clock [s].
+        sign: Factor of signed values; -1 if charging is positive.
+    """
+    elapsed_s = now_s - published.published_s
+    if snapshot.estimate is None or elapsed_s < MESSAGE_INTERVAL_S:
+        return published
+    entities_by_key = entities(discovery.info, discovery.cells)
+    values = _round_values(snapshot, entities_by_key, sign)
+    changed = {
+        key: value for key, value in values.items() if _is_due(published, key, value, entities_by_key[key], now_s)
+    }
+    recent_s = tuple(at_s for at_s in published.rows_s if now_s - at_s < MINUTE_S)
+    # first values are not limited, because all entities get one at once
+    rows = [key for key in changed if entities_by_key[key].enabled and key in published.values]
+    rows.sort(key=lambda key: published.changed_s[key])
+    for postponed in rows[MAX_ROWS_PER_MINUTE - len(recent_s) :]:
+        del changed[postponed]
+    if not changed and elapsed_s < HEARTBEAT_S:
+        return published
+    return published._replace(
+        values={**published.values, **changed},
+        changed_s={**published.changed_s, **dict.fromkeys(changed, now_s)},
+        published_s=now_s,
+        rows_s=(*recent_s, *[now_s for key in rows if key in changed]),
+    )
+
+
+def _round_values(snapshot: Snapshot, entities_by_key: Mapping[str, Entity], sign: float) -> dict[str, float | None]:
+    """Return the rounded value of each entity; None without a value."""
+    values, rounded = _values(snapshot), dict[str, float | None]()
+    for key, entity in entities_by_key.items():
+        value = values.get(key)
+        if value is not None and entity.signed:
+            value *= sign
+        # `or None` makes round() return an integer, `or 0` replaces -0.0
+        rounded[key] = None if value is None else round(value, entity.decimals or None) or 0
+    return rounded
+
+
+def _values(snapshot: Snapshot) -> dict[str, float | None]:
+    """Return all values of a snapshot by the keys of the entities."""
+    estimate, parameters = snapshot.estimate, snapshot.parameters
+    assert estimate is not None  # noqa: S101 - for the type checker: the caller has checked it
+    health = parameters.state_of_health.get("capacity")
+    return {
+        **vars(estimate),
+        **{key: element.value for key, element in parameters.elements.items()},
+        "soc_percent": estimate.soc_percent if estimate.soc_known else None,
+        "soc_std_percent": _scale(100.0, estimate.soc_std),
+        "time_to_cutoff_h": _scale(1.0 / 3600.0, estimate.time_to_cutoff_s),
+        "time_to_cutoff_p05_h": _scale(1.0 / 3600.0, estimate.time_to_cutoff_p05_s),
+        "time_to_cutoff_p95_h": _scale(1.0 / 3600.0, estimate.time_to_cutoff_p95_s),
+        "cutoff_within_15min_percent": _scale(100.0, estimate.cutoff_within_15min),
+        "time_to_full_h": _scale(1.0 / 3600.0, estimate.time_to_full_s),
+        "soh_percent": _scale(100.0, health.value if health else None),
+        "soh_std_percent": _scale(100.0, health.std if health else None),
+        **{cell_key(number): volts for number, volts in enumerate(estimate.cells_v or (), start=1)},
+    }
+
+
+def _scale(factor: float, value: float | None) -> float | None:
+    return None if value is None else factor * value
+
+
+def _is_due(published: EntityStates, key: str, value: float | None, entity: Entity, now_s: float) -> bool:
+    """Return True if a value should be published again."""
+    if key not in published.values:
+        return True
+    published_value, interval_passed = published.values[key], now_s - published.changed_s[key] >= entity.min_interval_s
+    if value is None or published_value is None:
+        return interval_passed and value is not published_value
+    min_change = entity.step if interval_passed else entity.immediate_step
+    return round(abs(value - published_value), entity.decimals) >= min_change
+
 
 AVAILABILITY = "availability"
 """Topic of the service's availability, below the device's topic."""

@@ -8,14 +8,10 @@ An addition does not increase it: readers ignore unknown fields.
 from typing import Any, NamedTuple
 
 from bms_estimator.model.events import Event
-from bms_estimator.model.payloads.alarm import Alarm
-from bms_estimator.model.payloads.cells import CellsReport
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.forecast import ForecastReport
 from bms_estimator.model.payloads.health import Health
-from bms_estimator.model.payloads.info import Info
-from bms_estimator.model.payloads.parameters import ParameterReport
 from bms_estimator.model.payloads.payload import PAYLOAD_VERSION, Payload
+from bms_estimator.model.payloads.snapshot import Alarm, CellsReport, ForecastReport, Info, ParameterReport
 
 
 class Topic(NamedTuple):

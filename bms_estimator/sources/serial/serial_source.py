@@ -12,7 +12,7 @@ import structlog
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.process.backoff import FIRST_RETRY_S
+from bms_estimator.process.tasks import FIRST_RETRY_S
 from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.registry import make_protocol
@@ -20,9 +20,8 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog, SilenceLog
 from bms_estimator.sources.serial.board_check import BoardCheck, OtherBoardError
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
-from bms_estimator.sources.serial.port_discovery import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery
 from bms_estimator.sources.serial.port_list import NoPortError, open_port
-from bms_estimator.sources.serial.serial_port import SerialPort
+from bms_estimator.sources.serial.serial_port import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery, SerialPort
 from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 if TYPE_CHECKING:

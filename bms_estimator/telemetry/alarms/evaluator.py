@@ -17,28 +17,26 @@ from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
 from bms_estimator.kernels.alarms import BROKEN_WIRE_V, MAX_SPACING_FRACTION
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_PROBES, CellBlock, ProbeBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarm_limits import STATE_LOST, AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
-from bms_estimator.telemetry.alarms.alarm_list import AlarmList
-from bms_estimator.telemetry.alarms.cell_alarms import CellAlarms
-from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, EstimateAlarms
-from bms_estimator.telemetry.alarms.faulty_fraction import FaultyFraction, SampleCounts
+from bms_estimator.telemetry.alarms.alarm_list import AlarmList, find_unwatched
+from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, CellAlarms, EstimateAlarms
 from bms_estimator.telemetry.alarms.inputs import Inputs, count_values
 from bms_estimator.telemetry.alarms.measured_values import (
+    UNUSABLE,
+    SampleBuffer,
     WireLimits,
     has_bit,
     measured_values,
     uncertain_values,
 )
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.sample_buffer import UNUSABLE, SampleBuffer
-from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
+from bms_estimator.telemetry.alarms.sample_intervals import FaultyFraction, SampleCounts, SampleIntervals
 from bms_estimator.telemetry.alarms.sensor_faults import FaultTexts, ProbeFaults
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
-from bms_estimator.telemetry.alarms.unwatched import find_unwatched
 from bms_estimator.telemetry.cells import CellFaults
 from bms_estimator.telemetry.impossible import PackBounds
 

@@ -1,12 +1,30 @@
-"""Messages about an alarm: its payload and its changes."""
+"""Messages about an alarm: its payload with a text, and its changes."""
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.alarm_limits import AlarmDefinition
 from bms_estimator.telemetry.alarms.state import RaisedAlarm
-from bms_estimator.telemetry.alarms.text import alarm_text
+
+LATCHED = "the cause is gone; acknowledge it to end it: "
+"""Prefix of the text of a latched alarm."""
+
+
+def alarm_text(alarm: AlarmDefinition, value: float | None, reasons: Sequence[str], *, cause_cleared: bool) -> str:
+    """Return one or two sentences: the fault and its remedy.
+
+    Args:
+        alarm: The alarm.
+        value: Value when the alarm was raised, in the unit of the alarm; None without a number.
+        reasons: Other causes, one sentence each.
+        cause_cleared: True if the cause is gone but the alarm is latched.
+    """
+    unit = f" {alarm.kind.unit}" if alarm.kind.unit else ""
+    numbers = "" if value is None else f": {value:.4g}{unit}, limit {alarm.limit:.4g}{unit}"
+    text = f"{alarm.kind.fault}{numbers}; {alarm.kind.remedy}"
+    return (LATCHED if cause_cleared else "") + "; ".join((text, *reasons))
 
 
 class Change(NamedTuple):

@@ -16,8 +16,8 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 from bms_estimator.telemetry.state import make_state_payload
+from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 from tests.benchmarks.load import CELL, pulses
 from tests.benchmarks.table import Row
 

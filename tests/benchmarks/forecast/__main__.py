@@ -1,7 +1,7 @@
 """Forecasts of the time to the cut-off on real captures.
 
 Each discharge is replayed through the estimator and the forecaster. Every minute before the cut-off the forecast is compared
-with the true time to the cut-off T. docs/theory/forecast-figures.md defines the figures.
+with the true time to the cut-off T. docs/theory/forecast.md defines the figures.
 """
 
 import argparse

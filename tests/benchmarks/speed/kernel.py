@@ -42,7 +42,7 @@ def rows() -> Iterator[Row]:
     printed_law_ns, learning_law_ns = both_laws_ns(block)
     yield Row("observer step in run", "at most 300 ns", f"{kernel_ns:.0f} ns", kernel_ns <= 300.0)
     yield Row("  the same in C, -O3 -march=native", "-", f"{c_ns:.0f} ns", None)
-    yield Row("  ratio", "at most 1.5", f"{kernel_ns / c_ns:.2f}", kernel_ns <= 1.5 * c_ns)
+    yield Row("  ratio", "at most 1.15", f"{kernel_ns / c_ns:.2f}", kernel_ns <= 1.15 * c_ns)
     yield Row("observer step in run, the learning law", "-", f"{learning_law_ns:.0f} ns", None)
     yield Row("  the printed law in the same rounds", "-", f"{printed_law_ns:.0f} ns", None)
     whole_ns = whole_step_ns(block)
@@ -74,6 +74,7 @@ def rows() -> Iterator[Row]:
 def kernel_and_c_ns(block: SampleBlock) -> tuple[float, float]:
     """Return the time per sample of ``run`` and of its C version, measured alternately [ns]."""
     estimator, c_estimator = (Estimator(load_cell(CELL), identifier=None) for _ in range(2))
+    estimator.settings_record["series_resistance"] = 0  # the C version does not estimate R_s
     trace = np.zeros(BLOCK, dtype=TRACE)
     with tempfile.TemporaryDirectory() as folder:
         observer_in_c = ObserverInC(Path(folder))

@@ -18,7 +18,7 @@ from bms_estimator.calibration.thesis.series_resistance import SeriesResistance,
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.reports.thesis import printed_values
-from bms_estimator.reports.thesis.claims import CLAIMS, claim, products
+from bms_estimator.reports.thesis.experiment import CLAIMS, claim, products
 from bms_estimator.reports.thesis.procedure import KNEE_SOC, Capture, Kind, Procedure
 from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks.recipes import DATA, LFP, NCR, PF, charge_ah, path_of

@@ -1,6 +1,6 @@
 """Comparison of the cell file that ``cell export`` writes after two weeks with a generic and a laboratory file.
 
-``python -m tests.benchmarks.weeks.exported_file`` prints the table of docs/cell/export.md: RMSE of the SOC, fraction of time
+``python -m tests.benchmarks.weeks.exported_file`` prints the table of docs/cell/index.md: RMSE of the SOC, fraction of time
 inside two std, mean std and interval score, all in %. The test days have another use of the same packs, and begin with a wrong
 SOC. The laboratory file is that of another cell of the type.
 """

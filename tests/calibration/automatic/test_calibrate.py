@@ -8,7 +8,7 @@ from bms_estimator.calibration.automatic.capacity_estimate import estimate_capac
 from bms_estimator.calibration.automatic.hold_back import hold_back
 from bms_estimator.calibration.automatic.recognition import recognize
 from bms_estimator.calibration.elements.identify import identify
-from bms_estimator.cli.cell.calibration_output import remarks
+from bms_estimator.cli.cell.calibrate import remarks
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
 from bms_estimator.model.cell import load_cell, with_capacity

@@ -7,8 +7,7 @@ unstable at a low SOC. Both ends are detected or given.
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
-from bms_estimator.calibration.thesis.parameter_average import AveragingWindow, averaged, averaging_window
+from bms_estimator.calibration.thesis.adaptive_run import AveragingWindow, adaptive_run, averaged, averaging_window
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError

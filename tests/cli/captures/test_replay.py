@@ -19,7 +19,7 @@ from bms_estimator import estimate, load_capture, load_cell
 from bms_estimator.forecast.forecast import FORECAST
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
-from bms_estimator.telemetry.stability_margin import NOT_IDENTIFIED
+from bms_estimator.telemetry.state import NOT_IDENTIFIED
 from tests.command_line import run
 
 SUMMARY_KEYS = {  # some of the keys

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
+from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import new_estimator

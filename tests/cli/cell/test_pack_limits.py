@@ -2,7 +2,7 @@
 
 import pytest
 
-from bms_estimator.cli.cell.pack_limits import pack_limits
+from bms_estimator.cli.cell.calibrate_live import pack_limits
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.pack import Settings
 

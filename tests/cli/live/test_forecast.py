@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.arrays_file import LOAD_SUFFIX
-from bms_estimator.checkpoint.checkpoint_file import CheckpointFile
-from bms_estimator.checkpoint.state_files import StateFiles
+from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.forecast.saved_load import load_arrays
 from bms_estimator.model.cell import load_cell

@@ -21,7 +21,7 @@ from bms_estimator.fleet.nats.stream_sizes import (
     block_bytes,
     stream_sizes,
 )
-from bms_estimator.fleet.nats.streams import HOURS_FRACTION, make_streams, pack_blocks
+from bms_estimator.fleet.nats.streams import HOURS_FRACTION, make_streams
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.server.disk_space import sizes_of
@@ -106,12 +106,13 @@ def test_block_hour_and_state_with_cell_voltages_are_at_most_as_large_as_compute
 @pytest.mark.parametrize("packs", [1, 1000, 100_000])
 @pytest.mark.parametrize("days", [0.5, 7.0, 30.0])
 @pytest.mark.parametrize("cells", [0, 16])
-def test_streams_hold_the_outage_for_any_number_of_packs(packs: int, days: float, cells: int) -> None:
-    sizes = stream_sizes(packs, days, cells)
+@pytest.mark.parametrize("block_s", [10.0, 60.0])
+def test_streams_hold_the_outage_for_any_number_of_packs(packs: int, days: float, cells: int, block_s: float) -> None:
+    sizes = stream_sizes(packs, days, cells, block_s)
     assert sizes.raw >= packs * days * DAY_BLOCKS * block_bytes(cells)
     assert sizes.states >= packs * (STATE_BYTES + cells * CELL_STATE_BYTES)
     assert HOURS_FRACTION * sizes.raw >= packs * days * 24 * HOUR_ROW_BYTES
-    assert pack_blocks(sizes.raw) >= days * DAY_BLOCKS
+    assert sizes.pack_blocks >= days * 86_400 / block_s
 
 
 @pytest.mark.parametrize(("tenant_cells", "cells"), [(None, 16), (0, 0), (4, 4)])

@@ -29,6 +29,7 @@ STREAMS = (
     subjects.HISTORY_STREAM,
     subjects.FITS_STREAM,
     f"OBJ_{subjects.STATES_BUCKET}",
+    f"KV_{subjects.PACKS_BUCKET}",
 )
 
 
@@ -74,7 +75,7 @@ async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_p
                     f"p00001: {BLOCKS - 1} blocks, 0 dead letters, 1 hourly summary and the state in "
                 )
                 assert "0 checkpoints" not in out
-                assert "remaining:\n  their names in the table of packs" in out
+                assert "remaining:\n  their rows in the Parquet files" in out
                 assert await occurrences(nc, "p00001") == []
                 await send(nc, "p00002", block("p00002", BLOCKS))
                 await heartbeats.until(lambda last: last["w1"].packs == 1)
@@ -161,11 +162,11 @@ async def test_pack_without_a_worker_is_erased_and_messages_in_other_streams_are
 
 @pytest.fixture
 def folder(tmp_path):
-    """Return a folder with rows of two packs, and one quarantined row of each."""
-    for pack in ("p00001", "p00002"):
-        write(tmp_path / "hours", [make_hour(pack, BEGIN + n, received_hour=BEGIN + n + 1) for n in range(30)])
-        write(tmp_path / "hours", [make_hour(pack, 5, received_hour=BEGIN, revision=1, clock_error_s=-4e8)])
-    return tmp_path / "hours"
+    """Return a folder whose files have rows of two packs, and one quarantined row of each."""
+    packs, folder = ("p00001", "p00002"), tmp_path / "hours"
+    write(folder, [make_hour(pack, BEGIN + n, received_hour=BEGIN + n + 1) for pack in packs for n in range(30)])
+    write(folder, [make_hour(pack, 5, received_hour=BEGIN, revision=1, clock_error_s=-4e8) for pack in packs])
+    return folder
 
 
 def test_rows_are_erased_from_the_files_while_no_collector_runs(tmp_path, folder, capsys):

@@ -8,7 +8,14 @@ import pytest
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.nats.stream_reader import BATCH_MESSAGES, StreamError
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.packs.pack_bucket import PackBucket, WriteCounts, read_bucket, remove_keys, write_bucket
+from bms_estimator.fleet.packs.pack_bucket import (
+    PackBucket,
+    WriteCounts,
+    purge_keys,
+    read_bucket,
+    remove_keys,
+    write_bucket,
+)
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_file import cell_text
@@ -89,6 +96,16 @@ async def test_refresh_after_the_table_was_recreated_returns_the_changed_packs(n
     assert await bucket.refresh() == {"a", *rows}
     assert bucket.packs("a")
     assert bucket.packs("b") is None
+
+
+async def test_refresh_finds_that_a_row_was_purged_with_the_mark_of_its_removal(nc):
+    await write_bucket(nc, PACKS_BUCKET, {"a": LFP_ROW, "b": LFP_ROW})
+    bucket = PackBucket(nc)
+    await bucket.refresh()
+    await purge_keys(nc, PACKS_BUCKET, ["a"])
+    assert await bucket.refresh() == {"a"}
+    assert list(bucket.packs) == ["b"]
+    assert await bucket.refresh() == set()
 
 
 async def test_follow_continues_after_the_server_was_killed(cluster, nc):

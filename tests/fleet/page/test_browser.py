@@ -192,7 +192,7 @@ async def test_packs_with_concerns_are_ranked_and_names_are_escaped(browser: Bro
         page = browser_tab.page
         expected = [
             "home-2 Small margin stability margin −1.3 % Low SOC SOC 4.1 %",  # noqa: RUF001 - as overview
-            "van-1 Suspected offset Uncertain SOC known to ± 14.2 %",
+            "van-1 Suspected offset",
             "home-1 Dead letters blocks could not be processed: version 2",
             f"{MARKUP_NAME} Unknown its blocks are held: no <b>row</b>",
         ]

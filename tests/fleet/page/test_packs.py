@@ -35,7 +35,7 @@ def test_pack_without_a_state_or_with_none_for_three_minutes_is_silent():
     packs.list_pack("c", "lfp 16s1p")
     packs.receive_state("b", healthy(), 100.0)
     overview = packs.overview(100.0 + ALIVE_S - 1.0, 0.0)
-    assert overview["packs"] == {"known": 3, "alive": 1, "silent": 2, "unlisted": 0}
+    assert overview["packs"] == {"known": 3, "alive": 1, "silent": 2, "unlisted": 0, "uncertain": 0}
     assert overview["concerns"]["silent"]["packs"] == [["c", None], ["a", 279.0]]
     assert overview["attention"] == 2
 
@@ -54,7 +54,7 @@ def test_pack_outside_the_table_counts_after_its_first_state_and_a_removed_pack_
     packs.list_pack("a", "lfp 16s1p")
     packs.list_pack("a", None)
     overview = packs.overview(1.0, 0.0)
-    assert overview["packs"] == {"known": 1, "alive": 1, "silent": 0, "unlisted": 1}
+    assert overview["packs"] == {"known": 1, "alive": 1, "silent": 0, "unlisted": 1, "uncertain": 0}
     assert [t["type"] for t in overview["types"]] == [UNLISTED]
 
 
@@ -100,15 +100,19 @@ def test_packs_with_concerns_are_ranked_and_count_once_for_attention():
     assert {kind: each["count"] for kind, each in concerns.items()} == {
         "margin": 2,
         "soc": 2,
-        "uncertain": 1,
         "suspects": 2,
         "silent": 0,
     }
     assert [name for name, _ in concerns["margin"]["packs"]] == ["low", "lower", "wide", "healthy"]
     assert concerns["soc"]["packs"][0] == ["lower", 0.02]
-    assert concerns["uncertain"]["packs"][0] == ["wide", 0.09]
     assert concerns["suspects"]["packs"] == [["wide", "sign of current, capacity"], ["healthy", "ocv"]]
     assert overview["attention"] == 4
+
+
+def test_uncertain_packs_of_a_new_fleet_are_counted_and_need_no_attention():
+    packs = receive_states({f"p{n}": healthy(soc_std=0.09) for n in range(133)} | {"known": healthy()})
+    overview = packs.overview(1.0, 0.0)
+    assert (overview["packs"]["uncertain"], overview["attention"]) == (133, 0)
 
 
 def test_only_the_packs_with_the_lowest_soc_are_listed():
@@ -259,7 +263,7 @@ def test_new_connection_clears_workers_but_not_packs():
     view.begin(1000.0)
     overview = view.overview(1001.0, 0.0)
     assert overview["workers"] == []
-    assert overview["packs"] == {"known": 1, "alive": 0, "silent": 0, "unlisted": 1}
+    assert overview["packs"] == {"known": 1, "alive": 0, "silent": 0, "unlisted": 1, "uncertain": 0}
     assert overview["listening_s"] == 1.0
 
 

@@ -157,7 +157,7 @@ def test_coverage_of_soc_bands_is_estimated_without_the_true_soc(tmp_path, facto
 def test_silent_pack_is_reported_with_its_last_values(tmp_path):
     write(tmp_path, [make_hour("lives", BEGIN + n) for n in range(30)])
     write(tmp_path, [make_hour("stopped", BEGIN + n, soc=0.1 * n) for n in range(5)])
-    (row,) = run_query(tmp_path, "silent").records
+    (row,) = run_query(tmp_path, "silent", wall=lambda: 3600.0 * (BEGIN + 30)).records
     assert (row["pack"], row["hours_silent"], row["silent_since"]) == ("stopped", 25, "2025-11-24T05:00:00Z")
     assert row["soc"] == pytest.approx(0.4)
 
@@ -179,7 +179,7 @@ def test_files_that_lack_columns_are_read_unless_pack_and_hour_are_missing(tmp_p
     (file,) = tmp_path.glob("*/*.parquet")
     pq.write_table(pq.read_table(file).drop_columns(["capacity_first_std", "r_s_ratio"]), file)
     for name in QUERIES:
-        assert run_query(tmp_path, name).rows == []
+        assert run_query(tmp_path, name, wall=lambda: 3600.0 * BEGIN).rows == []
     pq.write_table(pa.table({"x": [1]}), file)
     with pytest.raises(UserError, match="lack the columns pack and hour"):
         run_query(tmp_path, "soh")

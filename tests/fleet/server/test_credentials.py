@@ -1,6 +1,8 @@
 """Permissions on the real server: what edges, workers, readers and dashboards of two tenants may do."""
 
 import asyncio
+import base64
+import json
 import os
 import signal
 import stat
@@ -399,3 +401,21 @@ def test_errors_do_not_show_keys(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"edge\.nk: not a key") as raised:
         credentials.edge_token(tmp_path, "acme", "p1", NOW)
     assert "DEFECT" not in str(raised.value)
+
+
+def test_tokens_of_all_packs_of_a_table_are_written_for_their_owner_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    credentials.make_accounts(tmp_path / "keys", TENANTS, NOW)
+    packs = [f"p{n}" for n in range(100)]
+    (tmp_path / "packs.csv").write_text("pack,cell,capacity_ah,series\n" + "".join(f"{p},lfp,100,16\n" for p in packs))
+    for out in ("tokens", "tokens.csv"):
+        command = ("fleet", "users", "acme", tmp_path / "packs.csv", "--folder", tmp_path, "--out", tmp_path / out)
+        assert run(capsys, *command) == (0, f"{tmp_path / out}: 100 tokens written; keep them secret\n", "")
+    lines = (tmp_path / "tokens.csv").read_text().splitlines()
+    assert (lines[0], [line.split(",")[0] for line in lines[1:]]) == ("pack,token", packs)
+    files = [tmp_path / "tokens.csv", *(tmp_path / "tokens").iterdir()]
+    assert len(files) == 101
+    assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
+    claims = (tmp_path / "tokens" / "p7.token").read_text().split(".")[1]
+    assert json.loads(base64.urlsafe_b64decode(claims + "=" * (-len(claims) % 4)))["name"] == "p7"

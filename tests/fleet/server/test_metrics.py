@@ -153,7 +153,7 @@ def test_every_alert_rule_has_a_unit_test_and_is_documented() -> None:
     tests = (ROOT / "tests" / "deploy" / "fleet.rules.test.yml").read_text()
     assert len(alerts) >= 5
     assert [alert for alert in alerts if f'alertname="{alert}"' not in tests] == []
-    documented = re.findall(r"^\| `(Fleet\w+)`", (ROOT / "docs" / "fleet" / "metrics.md").read_text(), re.MULTILINE)
+    documented = re.findall(r"^\| `(Fleet\w+)`", (ROOT / "docs" / "fleet" / "operation.md").read_text(), re.MULTILINE)
     assert documented == alerts
 
 

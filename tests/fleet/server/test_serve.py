@@ -28,7 +28,7 @@ from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.nats_server_program import find_server
+from bms_estimator.process.child_process import find_server
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from tests.command_line import run
 from tests.fleet.serve_process import ServeProcess
@@ -213,7 +213,7 @@ async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_an
 async def test_server_logs_a_warning_when_unsaved_blocks_fill_half_of_the_stream(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tenant_watch, "UNSAVED_CHECK_S", 0.1)
+    monkeypatch.setattr(tenant_watch, "CHECK_S", 0.1)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
     # a stream of 2.3 MB
     spec = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4, packs=1, outage_days=0.002)))

@@ -12,9 +12,10 @@ import pytest
 from bms_estimator.edge import subjects
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.nats import unsaved_blocks as unsaved_module
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
 from bms_estimator.fleet.nats.streams import RAW_BYTES, make_streams
-from bms_estimator.fleet.nats.unsaved_blocks import unsaved_share
+from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.packs.pack_bucket import PackBucket, write_bucket
 from bms_estimator.fleet.simulation.block_publisher import run_edges
@@ -132,8 +133,28 @@ async def test_status_warns_when_unsaved_blocks_fill_half_of_the_stream(
         pointer = Pointer(kept=(CheckpointInfo(sequence=3, object="p0.1", bytes=1, made_s=1.79e9),))
         bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
         await bucket.put(pointer_key(0), pointer.model_dump_json().encode())
-        share = await unsaved_share(nc, range(PARTITIONS))
+        share = (await unsaved_blocks(nc, range(PARTITIONS))).share
         assert share == pytest.approx(0.3, abs=0.01)
+        await nc.close()
+
+
+async def test_blocks_that_the_limit_of_one_pack_drops_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unsaved_module, "MIN_BLOCK_S", 0.0)  # the blocks of this test have no duration
+    with running(tmp_path, 1, partitions=PARTITIONS) as cluster:
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=PARTITIONS, max_pack_blocks=10)
+        js = nc.jetstream()
+        for number in range(15):
+            await js.publish(subjects.raw("often"), b"%d" % number)
+        await js.publish(subjects.raw("seldom"), b"0")
+        bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
+        for sequence, has_dropped in ((3, True), (15, False)):
+            pointer = Pointer(kept=(CheckpointInfo(sequence=sequence, object="p0.1", bytes=1, made_s=1.79e9),))
+            await bucket.put(pointer_key(0), pointer.model_dump_json().encode())
+            warning = (await unsaved_blocks(nc, range(PARTITIONS))).warning
+            assert ("stores 10 blocks of a pack, has dropped blocks of often" in warning) == has_dropped
         await nc.close()
 
 

@@ -16,8 +16,8 @@ from bms_estimator.model.sample import NO_CELLS, SampleStatus
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_alarms
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.faulty_fraction import UNUSABLE_KINDS, SampleCounts
 from bms_estimator.telemetry.alarms.inputs import Inputs
+from bms_estimator.telemetry.alarms.sample_intervals import UNUSABLE_KINDS, SampleCounts
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters
 from bms_estimator.telemetry.impossible import PackBounds

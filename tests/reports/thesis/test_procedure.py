@@ -13,8 +13,7 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.thesis.claims import CLAIMS, Claim, Result, claim
-from bms_estimator.reports.thesis.experiment import Experiment, Recorded
+from bms_estimator.reports.thesis.experiment import CLAIMS, Claim, Experiment, Recorded, Result, claim
 from bms_estimator.reports.thesis.experiment_figures import FIGURES
 from bms_estimator.reports.thesis.procedure import Capture, Kind, Procedure, kind_of, printed_bounds
 from bms_estimator.reports.thesis.report_items import Reproduction
@@ -178,7 +177,7 @@ def test_the_figure_of_a_missing_load_is_empty_with_a_reason(samples, remaining,
 
 
 def test_errors_of_the_leaf_cell_are_those_of_the_document(leaf_procedure):
-    """The document is docs/theory/chapter5.md."""
+    """The document is docs/theory/thesis.md."""
     run, (soc, _) = leaf_procedure.dynamic["cc"], leaf_procedure.interpolated("cc")
     assert (run.mean_percent, run.max_percent) == pytest.approx((0.543, 2.37), abs=0.005)
     assert leaf_procedure.static["cc"].mean_percent == pytest.approx(0.517, abs=0.005)

@@ -15,8 +15,7 @@ import structlog
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.exports import InfluxSettings
-from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink
-from bms_estimator.sinks.exports.line_protocol import lines
+from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink, lines
 from tests.influxdb import INFLUXD, InfluxDB
 from tests.patience import until
 from tests.sinks.snapshots import CELL_SNAPSHOT, SNAPSHOT_WITHOUT_SAMPLES, SOC_LOW_ALARM

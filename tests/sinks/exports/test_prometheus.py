@@ -25,10 +25,10 @@ pytest.importorskip("prometheus_client", reason="prometheus-client is not instal
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from bms_estimator.sinks.exports.prometheus import PrometheusSink
-from bms_estimator.sinks.exports.prometheus_metrics import (
+from bms_estimator.sinks.exports.prometheus import (
     COUNTER_FIELDS,
     LIST_ITEMS,
+    PrometheusSink,
     name_and_factor,
 )
 

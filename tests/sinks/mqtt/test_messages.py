@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.model.payloads.alarm import Alarm
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState

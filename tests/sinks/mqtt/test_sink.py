@@ -12,7 +12,7 @@ import pytest
 import structlog
 from aiomqtt import ProtocolVersion
 
-from bms_estimator.demo.broker import DemoBroker
+from bms_estimator.demo.demo import DemoBroker
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.mqtt.broker_config import brokers, check
@@ -23,11 +23,10 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING, ReceiveQueue
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.backoff import MAX_DELAY_S
+from bms_estimator.process.tasks import MAX_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.sinks.mqtt.availability import CORRECTION_S
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
-from bms_estimator.sinks.mqtt.sink import MqttSink
+from bms_estimator.sinks.mqtt.sink import CORRECTION_S, MqttSink
 from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bms_estimator.settings.sources.modbus import MAX_WORDS, PROFILES, CellRegisters, ModbusSource, Register
-from bms_estimator.sources.fieldbus.modbus_registers import (
+from bms_estimator.sources.fieldbus.modbus import (
     GAP_WORDS,
     RegisterQuantity,
     decode,

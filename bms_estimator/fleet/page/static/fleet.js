@@ -54,7 +54,7 @@ function draw() {
 	text($("what"), `${counted(packs.known, "pack")} of ${counted(types.length, "type")} · as of ${f.clock(new Date(time))}`);
 	drawTiles(ui.fleet);
 	drawTypes(types);
-	drawSpread(types, soc_std_edges);
+	drawSpread(types, soc_std_edges, packs.uncertain);
 	drawConcerns(concerns);
 	drawWorkers(ui.fleet);
 	drawAnswers(ui.answers);
@@ -130,7 +130,7 @@ function drawTypes(types) {
 }
 
 const percentText = (x, known = x) => (f.isNumber(known) ? `${f.percent(x)} %` : "–");
-function drawSpread(types, edges) {
+function drawSpread(types, edges, uncertain) {
 	const shown = types.find((t) => t.type === ui.type), some = shown ? [shown] : types, of = shown ? ` · ${shown.type}` : "";
 	const sum = (name) => some.reduce((all, t) => all.map((n, i) => n + t[name][i]), some[0]?.[name].map(() => 0) ?? []);
 	const soc = sum("soc"), std = sum("soc_std"), at = (i) => Math.round(200 * (edges[i] ?? 0.5)), range = (i) => (i < edges.length - 1 ? `${at(i)}–${at(i + 1)}` : `>${at(i)}`);
@@ -138,7 +138,8 @@ function drawSpread(types, edges) {
 	bins($("std"), std, (i) => `± ${range(i).replace("–", " to ")} %`, (i) => (at(i) >= 20 ? "bad" : at(i) >= 10 ? "low" : ""), "Uncertainty");
 	if (changed($("stdedges"), "made")) $("stdedges").append(...std.map((_, i) => node("li", {}, range(i))));
 	put("socmedian", soc.some(Boolean) ? `median ${f.fixed(median(soc, (i) => 5 * i), 0)} %${of}` : "");
-	put("stdmedian", std.some(Boolean) ? `median ± ${f.fixed(median(std, at), 1)} %${of}` : "");
+	const unsure = uncertain ? ` · ${counted(uncertain, "pack")} above ± 10 %` : "";
+	put("stdmedian", std.some(Boolean) ? `median ± ${f.fixed(median(std, at), 1)} %${of}${unsure}` : "");
 }
 
 /** Median of binned values, which are assumed to be evenly distributed within each bin. */
@@ -166,7 +167,6 @@ function bins(list, counts, name, kind, title) {
 const KINDS = [
 	["margin", "Small margin", (v) => `stability margin ${f.percent(v)} %`],
 	["suspects", "Suspected", (v) => v],
-	["uncertain", "Uncertain", (v) => `SOC known to ± ${f.percent(2 * v)} %`],
 	["soc", "Low SOC", (v) => `SOC ${f.percent(v)} %`],
 	["silent", "Silent", (v) => (f.isNumber(v) ? `not heard for ${duration(v)}` : "never heard")],
 	["clock", "Wrong clock", (v) => `its clock is ${duration(Math.abs(v))} ${v > 0 ? "ahead" : "behind"}`],
@@ -175,11 +175,11 @@ const KINDS = [
 ];
 const NOTES = {
 	all: "The worst packs of each kind.", margin: "Live packs, smallest margin first; counted below 5 %. Below 0 the thesis's model is not valid.",
-	suspects: "Input faults that the identifier suspected in the last hour.", uncertain: "Live packs, widest band first; counted above ± 10 %.",
+	suspects: "Input faults that the identifier suspected in the last hour.", 
 	soc: "Live packs, lowest SOC first; counted below 10 %.", silent: "No message for three minutes or more.", clock: "The clock of the pack's edge is wrong: its hourly summaries are quarantined.",
 	dead: "Packs with blocks that no worker could process; fleet dead-letters lists these blocks.", unknown: "Packs that send blocks but are not in the table.",
 };
-const beyond = (kind, c, v) => !("limit" in c) || (kind === "uncertain" ? v > c.limit : v < c.limit);
+const beyond = (c, v) => !("limit" in c) || v < c.limit;
 
 /** Rows of [pack, [[kind, value], ...]]. The worst packs of each kind alternate; a pack has one row with all its reasons. */
 function ranked(concerns) {
@@ -187,7 +187,7 @@ function ranked(concerns) {
 	for (let rank = 0; rank < MAX_LISTED; rank += 1) {
 		for (const [kind] of KINDS) {
 			const c = concerns[kind], [pack, value] = c?.packs[rank] ?? [];
-			if (pack === undefined || !beyond(kind, c, value)) continue;
+			if (pack === undefined || !beyond(c, value)) continue;
 			if (!rows.has(pack)) rows.set(pack, []);
 			rows.get(pack).push([kind, value]);
 		}
@@ -202,7 +202,7 @@ function drawConcerns(concerns) {
 	if (!changed($("concerns"), JSON.stringify([ui.kind, rows]))) return;
 	const focused = document.activeElement?.dataset.pack;
 	$("concerns").replaceChildren(...rows.map(([pack, reasons]) => {
-		const mild = !reasons.some(([kind, value]) => beyond(kind, concerns[kind], value));
+		const mild = !reasons.some(([kind, value]) => beyond(concerns[kind], value));
 		const texts = reasons.map(([kind, value]) => {
 			const [, name, describe] = KINDS.find(([k]) => k === kind);
 			return node("p", {}, node("span", { class: `tag ${mild ? "" : kind}` }, name), " ", describe(value));
@@ -262,12 +262,12 @@ const percents = (x) => (f.isNumber(x) ? `${f.percent(x)} %` : "");
 const between = (low, high, format) => (f.isNumber(low) && f.isNumber(high) ? `${format(low)} to ${format(high)}` : "");
 // by query: title, note, text without rows, and columns as [heading, cell of a row]
 const QUESTIONS = {
-	soh: ["Capacity trend", "Change a year by type, with its 95 % band.", "No trend yet: seven days are needed.", [
+	failing: ["About to fail", "Packs with a faulty cell, that reach a limit within 90 days, or with recently suspected input faults.", "No pack.", [
+		["Pack", (r) => chooser(r.pack)], ["What", (r) => `${r.quantity.replaceAll("_", " ")}${f.isNumber(r.cell) ? ` of cell ${r.cell}` : ""}`], ["Value", (r) => f.digits(r.value, 3)], ["Limit", (r) => f.digits(r.limit, 3)],
+		["Days left", (r) => (f.isNumber(r.days_left) ? f.fixed(r.days_left, 0) : "")]]],
+	soh: ["Capacity trend", "Change a year by type, with its 95 % band.", "", [
 		["Type", (r) => r.type], ["Packs", (r) => count(r.packs)], ["Capacity", (r) => percents(r.capacity_ratio)],
 		["A year", (r) => `${f.fixed(r.percent_per_year, 1)} %`], ["Band", (r) => between(r.percent_per_year_low, r.percent_per_year_high, (x) => `${f.fixed(x, 1)} %`)]]],
-	failing: ["About to fail", "Packs that reach a limit within 90 days, or have had suspected input faults recently.", "No pack.", [
-		["Pack", (r) => chooser(r.pack)], ["What", (r) => r.quantity.replaceAll("_", " ")], ["Value", (r) => f.digits(r.value, 3)], ["Limit", (r) => f.digits(r.limit, 3)],
-		["Days left", (r) => (f.isNumber(r.days_left) ? f.fixed(r.days_left, 0) : "")]]],
 	outliers: ["Outliers of their type", "Packs whose capacity or Rₛ deviates from those of their type.", "No pack.", [
 		["Pack", (r) => chooser(r.pack)], ["What", (r) => r.quantity.replaceAll("_", " ")], ["Value", (r) => f.digits(r.value, 3)], ["Type's median", (r) => f.digits(r.median_of_type, 3)],
 		["Deviations", (r) => f.fixed(r.score, 1)]]],
@@ -278,15 +278,19 @@ const QUESTIONS = {
 
 function drawAnswers(answers) {
 	hide($("timecard"), !answers);
+	hide($("failingcard"), !answers);
 	if (!answers || !changed($("answers"), JSON.stringify(answers))) return;
-	$("answers").replaceChildren(...Object.entries(QUESTIONS).filter(([name]) => answers[name]).map(([name, [title, note, noRows, columns]]) => {
-		const { reason, columns: names = [], rows = [], count: all } = answers[name];
-		const records = rows.map((row) => Object.fromEntries(row.map((value, i) => [names[i], value])));
-		const table = node("table", {}, node("thead", {}, node("tr", {}, ...columns.map(([head]) => node("th", { scope: "col" }, head)))),
-			node("tbody", {}, ...records.map((r) => node("tr", {}, ...columns.map(([, cell]) => node("td", {}, cell(r) ?? ""))))));
-		const message = reason ?? (rows.length ? note + (all > rows.length ? ` The first ${rows.length} of ${count(all)}.` : "") : noRows);
-		return node("div", { "data-answer": name }, node("h3", {}, title), node("p", { class: "note" }, message), ...(rows.length ? [node("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": title }, table)] : []));
-	}));
+	const tables = Object.entries(QUESTIONS).filter(([name]) => answers[name]).map(([name, question]) => answerTable(name, question, answers[name]));
+	$("failing").replaceChildren(...tables.filter((t) => t.dataset.answer === "failing"));
+	$("answers").replaceChildren(...tables.filter((t) => t.dataset.answer !== "failing"));
+}
+
+function answerTable(name, [title, note, noRows, columns], { reason, columns: names = [], rows = [], count: all, notes = [] }) {
+	const records = rows.map((row) => Object.fromEntries(row.map((value, i) => [names[i], value])));
+	const table = node("table", {}, node("thead", {}, node("tr", {}, ...columns.map(([head]) => node("th", { scope: "col" }, head)))),
+		node("tbody", {}, ...records.map((r) => node("tr", {}, ...columns.map(([, cell]) => node("td", {}, cell(r) ?? ""))))));
+	const message = reason ?? [rows.length ? note + (all > rows.length ? ` The first ${rows.length} of ${count(all)}.` : "") : noRows, ...notes].filter(Boolean).join(" ");
+	return node("div", { "data-answer": name }, node("h3", {}, title), node("p", { class: "note" }, message), ...(rows.length ? [node("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": title }, table)] : []));
 }
 
 // details of one pack

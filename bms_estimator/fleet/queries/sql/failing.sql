@@ -1,4 +1,4 @@
--- Packs that will soon reach a limit, or have recent input faults. Needs: packs, days, fits.
+-- Packs with a faulty cell, packs that will soon reach a limit, and packs with recent input faults. Needs: hours, packs, days, fits.
 WITH limits(quantity, limit_value, shown, sense) AS (
     VALUES ('capacity', ln($capacity_limit), 'capacity_ratio', -1), ('r_s', ln($r_s_limit), 'r_s_ratio', 1),
         ('margin', 0.0, 'stability_margin_min', -1)
@@ -46,10 +46,43 @@ suspected AS (
     GROUP BY pack, name
     HAVING value > 0.5
         AND coalesce(avg(CASE WHEN suspects & bit > 0 THEN 1 ELSE 0 END) FILTER (day <= $today - $recent_days), 1) < 0.1
+),
+recent AS (
+    SELECT *, count(*) OVER (PARTITION BY pack) AS hours FROM hours
+    WHERE weakest_cell IS NOT NULL AND hour // 24 > $today - $recent_days
+),
+-- margin: several standard deviations, which must be between value and limit
+cell_values AS (
+    SELECT pack, hours, weakest_cell AS cell, 'cell SOC' AS quantity, weakest_cell_soc_deviation AS value,
+        -$weak_cell_soc AS limit_value, 'below' AS sense, 3 * weakest_cell_soc_deviation_std AS margin
+    FROM recent
+    UNION ALL
+    SELECT pack, hours, smallest_cell, 'cell capacity', smallest_cell_capacity_ratio, $small_cell_ratio, 'below', 0 FROM recent
+    UNION ALL
+    SELECT pack, hours, resistive_cell, 'cell resistance', resistive_cell_ratio, $resistive_cell_ratio, 'above',
+        2 * resistive_cell_ratio_std
+    FROM recent
+    UNION ALL
+    SELECT pack, hours, self_discharge_cell, 'cell self-discharge', self_discharge_a, $self_discharge_c * capacity_ah, 'above',
+        greatest($stds * self_discharge_std_a - $self_discharge_c * capacity_ah, 0)
+    FROM recent
+),
+cells AS (
+    SELECT
+        pack, cell, quantity, median(value) AS value, any_value(limit_value) AS limit_value, NULL::DOUBLE AS per_year,
+        0.0 AS days_left, NULL::DOUBLE AS earliest, NULL::DOUBLE AS latest, NULL::DOUBLE AS stds
+    FROM cell_values
+    WHERE CASE sense WHEN 'below' THEN value + margin < limit_value ELSE value - margin > limit_value END
+    GROUP BY pack, cell, quantity
+    HAVING count(*) > 0.5 * any_value(hours)
 )
 SELECT
-    type, pack, quantity, value, limit_value AS "limit", per_year, days_left,
+    type, pack, quantity, cell, value, limit_value AS "limit", per_year, days_left,
     greatest(earliest, 0) AS days_left_low, latest AS days_left_high, stds
-FROM (SELECT * FROM trends WHERE stds > $stds AND days_left <= $within_days UNION ALL SELECT * FROM suspected)
+FROM (
+    SELECT * FROM cells
+    UNION ALL BY NAME SELECT * FROM trends WHERE stds > $stds AND days_left <= $within_days
+    UNION ALL BY NAME SELECT * FROM suspected
+)
 JOIN packs USING (pack)
-ORDER BY days_left, stds DESC, pack, quantity
+ORDER BY days_left, cell IS NULL, stds DESC, pack, quantity

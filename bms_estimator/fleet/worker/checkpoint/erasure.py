@@ -16,7 +16,7 @@ from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S, require_partitions
-from bms_estimator.fleet.packs.pack_bucket import POLL_S, read_bucket, remove_keys
+from bms_estimator.fleet.packs.pack_bucket import POLL_S, purge_keys, read_bucket, remove_keys
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
 from bms_estimator.fleet.worker.checkpoint.claims import change_checkpoints
@@ -84,6 +84,7 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
     for pack in packs:
         await nc.jetstream().purge_stream(subjects.FITS_STREAM, subject=subjects.fit_request(pack))
         await erase_messages(nc, subjects.HISTORY_STREAM, subjects.history(pack))
+    await purge_keys(nc, subjects.PACKS_BUCKET, packs)
     remaining = await _remaining(nc, packs)
     return {
         pack: Erasure(blocks[pack], dead_letters[pack], checkpoints[pack], hours[pack], remaining[pack])

@@ -1,0 +1,70 @@
+"""Reader of the changes of a key-value bucket by polling."""
+
+from collections.abc import Callable
+
+import nats.errors
+from nats.aio.client import Client
+
+from bms_estimator.fleet.nats.connection import error_text
+from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError, read_stream
+
+_REMOVING_OPERATIONS = frozenset({"DEL", "PURGE"})
+
+
+class BucketReader:
+    """Reader of a bucket; each call of ``read`` continues where the previous one ended.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+        bucket: Name of the bucket.
+    """
+
+    def __init__(self, nc: Client, bucket: str) -> None:
+        self._nc, self._bucket = nc, bucket
+        self._next_sequence = 1
+        self._created: object = None  # creation time of the stream with this sequence number
+        self._keys = set[str]()  # also those whose removal is marked
+
+    async def read(self, set_value: Callable[[str, bytes | None], object]) -> None:
+        """Call ``set_value`` with each changed key and its value; None: the key was removed.
+
+        A bucket with fewer keys than were read is read from its beginning: an erasure has purged some (``purge_keys``).
+
+        Raises:
+            StreamError: The server does not respond, or has no such bucket.
+        """
+        try:
+            info = await self._nc.jetstream().stream_info(stream_of(self._bucket))
+        except nats.errors.Error as error:
+            raise StreamError(f"the server rejects reading {stream_of(self._bucket)}: {error_text(error)}") from None
+        # another bucket of this name uses the numbers again
+        is_other = info.created != self._created or info.state.last_seq + 1 < self._next_sequence
+        is_purged = not is_other and info.state.messages < len(self._keys)
+        first = 1 if is_other or is_purged else self._next_sequence
+        found, last = set[str](), first - 1
+        async for batch in read_stream(self._nc, stream_of(self._bucket), subject_of(self._bucket, ">"), first=first):
+            for message in batch:
+                key, data = entry(self._bucket, message)
+                found.add(key)
+                set_value(key, data)
+            last = batch[-1].sequence
+        for key in self._keys - found if is_purged else ():
+            set_value(key, None)
+        self._keys = found if first == 1 else self._keys | found
+        self._next_sequence, self._created = last + 1, info.created
+
+
+def entry(bucket: str, message: StoredMessage) -> tuple[str, bytes | None]:
+    """Return key and value of a message; the value None means that the key was removed."""
+    is_removed = message.headers.get("KV-Operation") in _REMOVING_OPERATIONS or "Nats-Marker-Reason" in message.headers
+    return message.subject.removeprefix(subject_of(bucket, "")), None if is_removed else message.data
+
+
+def stream_of(bucket: str) -> str:
+    """Return the name of a bucket's stream."""
+    return f"KV_{bucket}"
+
+
+def subject_of(bucket: str, key: str) -> str:
+    """Return the subject of a key."""
+    return f"$KV.{bucket}.{key}"
