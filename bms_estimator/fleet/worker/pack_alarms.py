@@ -77,7 +77,8 @@ class PackAlarms:
         """
         if self._scratch.shape[1] < samples.size:
             self._scratch = np.zeros((6, samples.size))
-        self._part[0] = wall_offset_s, *self._cell_values(pack_type), math.nan
+        slow_fit = pack_type.pack.slow_fit
+        self._part[0] = wall_offset_s, *self._cell_values(pack_type), slow_fit.weak_cell_std if slow_fit else math.nan
         self._inputs = samples, cells_v
         limits, settings = pack_type.alarms.limits, pack_type.alarms.settings
         self._has_changed |= kernel.evaluate(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.restore import copy_known_fields
+from bms_estimator.fleet.fits.messages import COMPARED
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
 from bms_estimator.kernels.alarms import ALARMS
@@ -99,6 +100,10 @@ FIT = np.dtype(
         ("in_force", PACK_FIT),
         # fit that waits for its adoption
         ("received", PACK_FIT),
+        # 1: ``weakest`` is known
+        ("has_weakest", "i8"),
+        # weakest cell of a bank by the last fits
+        ("weakest", COMPARED),
     ],
     align=True,
 )
