@@ -23,7 +23,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month bank cells observability power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema notebook lock
+.PHONY: help venv apt audit check deb addon docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month bank cells power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema compile-order notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -108,9 +108,6 @@ bank: venv ## the weakest cell of simulated banks: false alarms, detection and e
 cells: venv ## single cells of simulated packs: shorts and false alarms, beside three other detectors: minutes
 	@$(BIN)/python -m tests.benchmarks.cells $(ARGS)
 
-observability: venv ## the lower bound of the std of the SOC by cell and SOC window, e.g. make observability ARGS="lfp --window 0.5 0.95"
-	@$(BIN)/python -m tests.benchmarks.observability $(ARGS)
-
 forecast: venv ## forecasts of the time to cut-off on real captures, e.g. make forecast ARGS="n10_us06 leaf": half an hour
 	@$(BIN)/python -m tests.benchmarks.forecast $(ARGS)
 
@@ -166,6 +163,11 @@ integrations: apt venv prometheus ## tests with the real Node-RED, AsyncAPI pars
 deb: venv ## the Debian package in build/deb, with the program and the packages that it requires: three minutes
 	@$(BIN)/python deploy/debian/build.py build/deb
 
+addon: venv ## a repository with the Home Assistant add-on in build/addon, for a Git server or the folder /addons
+	rm -rf build/addon && mkdir -p build/addon && cp deploy/home-assistant/repository.yaml build/addon
+	cp -r deploy/home-assistant/addon build/addon/bms_estimator
+	$(BIN)/python -m hatchling build --target wheel --directory build/addon/bms_estimator
+
 docs: venv ## the documentation as a site in build/site, with checked links
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
@@ -179,7 +181,10 @@ notebook: venv ## execute the notebook of the documentation, and write its outpu
 	@$(BIN)/python -m tests.library.notebook
 
 kernels: venv
-	$(BIN)/python -c 'from bms_estimator.service.kernel_warm_up import load_kernels; load_kernels()'
+	$(BIN)/bms-estimator compile
+
+compile-order: venv ## record the order in which a first start compiles the kernels, after a change of their names or arguments: a minute
+	folder=$$(mktemp -d) && NUMBA_CACHE_DIR=$$folder $(BIN)/python -m tests.service.compile_order; rm -r $$folder
 
 lock: ## update requirements.lock, requirements-core.lock and the SBOM of the wheel after a change of dependencies (needs uv)
 	uv pip compile --quiet --all-extras --group dev --generate-hashes --no-header --universal pyproject.toml -o requirements.lock

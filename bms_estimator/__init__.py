@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from bms_estimator.calibration.validate import validate
     from bms_estimator.estimator import Estimator, estimate
     from bms_estimator.model.cell import load_cell
-    from bms_estimator.model.cell_file import write_cell
+    from bms_estimator.model.pack_model import write_cell
     from bms_estimator.pack.pack import Pack, new_pack
     from bms_estimator.settings.pack import Settings
     from bms_estimator.sources.captures.replay import load_capture

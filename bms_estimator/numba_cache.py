@@ -4,9 +4,12 @@ numba checks only the file of the compiled function. It does not notice a change
 kernel calls, or of the constants that it compiles in. Therefore the cache folder carries a hash of all these files. All
 installations of a version share the folder.
 
-Every kernel imports ``njit`` from here: importing it sets the cache folder. If the cache cannot be written or read,
-kernels are compiled at each start. Each cached file ends with a digest, because machine code damaged by a power cut
-would run.
+Kernels are compiled for the generic CPU of an architecture. Compiled kernels therefore run on every machine of the
+architecture, with the same results to the last bit. Packages and images contain them in ``SHIPPED_FOLDER``, which is only
+read.
+
+Every kernel imports ``njit`` from here. If the cache cannot be written or read, kernels are compiled at each start. Each
+cached file ends with a digest, because machine code damaged by a power cut would run.
 """
 
 import contextlib
@@ -15,24 +18,25 @@ import functools
 import hashlib
 import importlib
 import os
+import pickle
+import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, Self, TypeVar, cast
+from typing import Any, BinaryIO, TypeVar, cast
 
 import numba
 from numba import types
-from numba.core.caching import Cache, CompileResultCacheImpl, IndexDataCacheFile, _CacheLocator
+from numba.core.caching import CompileResultCacheImpl, NullCache
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.dispatcher import Dispatcher
+from numba.core.serialize import dumps
 
 __all__ = [
     "CACHE_FOLDER",
     "COMPILED_IN",
+    "SHIPPED_FOLDER",
     "cache_folders",
-    "count_cached_kernels",
-    "count_kernels",
     "njit",
     "source_digest",
 ]
@@ -45,14 +49,10 @@ kernel's name."""
 OFFSET_BYTES = 7
 """Length of the hash that is the offset of a lock [bytes]. It is long enough that two kernels have different offsets, and
 short enough for a file offset of 63 bits."""
-# Any, because methods of these classes are replaced below
-_Cache: Any = Cache
-_CacheFile: Any = IndexDataCacheFile
-_CacheImpl: Any = CompileResultCacheImpl
-_Dispatcher: Any = Dispatcher
 _numba_njit: Any = numba.njit  # its stubs lack no_cfunc_wrapper
 _unliteral: Any = types.unliteral
-_numba_dump, _numba_load = _CacheFile._dump, _CacheFile._load_data  # noqa: SLF001 - numba has no public hook for a check
+_rebuild: Any = CompileResultCacheImpl.rebuild
+_dumps: Any = dumps
 _PACKAGE = Path(__file__).parent
 COMPILED_IN = (
     *sorted((_PACKAGE / "kernels").rglob("*.py")),
@@ -73,9 +73,11 @@ COMPILED_IN = (
     ),
 )
 """Files whose content is compiled into kernels: kernels, frame decoding and their constants."""
+# before numba chooses the target of the first kernel; the features of this machine's CPU would be added to the generic one
+numba.config.CPU_NAME, numba.config.CPU_FEATURES = "generic", ""  # type: ignore[attr-defined]
 
 
-def njit(**options: Any) -> Callable[[Function], Function]:
+def njit(*, cache: bool = False, **options: Any) -> Callable[[Function], Function]:
     """Return numba's decorator of the same name, without two features that cost compile time and that no kernel needs.
 
     numba compiles a kernel again for each constant among the arguments of a call, although the optimizer inserts the
@@ -88,6 +90,8 @@ def njit(**options: Any) -> Callable[[Function], Function]:
         kernel: Any = _numba_njit(no_cfunc_wrapper=True, **options)(function)
         numba_template, numba_compile = kernel.get_call_template, kernel.compile
         name = f"{function.__module__}.{function.__qualname__}"
+        if cache:
+            kernel._cache = _KernelCache(function)  # noqa: SLF001 - numba has no public function for another cache
 
         def get_call_template(args: Any, keywords: Any) -> Any:
             return numba_template(
@@ -132,76 +136,85 @@ def cache_folders() -> list[Path]:
 
 def _cache_folder() -> Path | None:
     """Return this version's folder in the first cache folder that can be written; None without one."""
-    digest = source_digest()
     for folder in cache_folders():
         with contextlib.suppress(OSError):
-            version_folder = folder / digest
+            version_folder = folder / _DIGEST
             version_folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=version_folder).close()
             return version_folder
+    warnings.warn("compiled kernels are not stored: no folder can be written", RuntimeWarning, stacklevel=1)
     return None
 
 
-def count_kernels() -> int:
-    """Return the number of kernels of this version."""
-    return sum(source.read_text(encoding="utf-8").count("\n@njit(") for source in COMPILED_IN)
+class _KernelCache(NullCache):
+    """Cache of a kernel, in one file for each signature and minor version of Python.
 
-
-def count_cached_kernels() -> int:
-    """Return the number of kernels in the cache, also of those that other processes have compiled."""
-    if CACHE_FOLDER is None:
-        return 0
-    folders = {source.parent.relative_to(_PACKAGE) for source in COMPILED_IN}
-    return sum(1 for folder in folders for _ in (CACHE_FOLDER / folder).glob("*.nbi"))
-
-
-@functools.cache
-def _kernel_folder(source: str) -> str | None:
-    """Return the folder of a source file's kernels, below the cache folder. Create it if it does not exist.
-
-    Return None for a file of another package, or if the folder cannot be written.
+    numba's own cache depends on the absolute path of the source file, so that each installation would compile the kernels
+    again, and it has one folder, which must be writable.
     """
-    file = Path(source)
-    if not file.is_relative_to(_PACKAGE):
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        code, source = function.__code__, Path(function.__code__.co_filename)
+        name = (
+            f"{source.stem}.{function.__qualname__}-{code.co_firstlineno}.py{sys.version_info[0]}{sys.version_info[1]}"
+        )
+        self._path = source.parent.relative_to(_PACKAGE) / name if source.is_relative_to(_PACKAGE) else None
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Return the compiled kernel; None if it must be compiled."""
+        context.refresh()  # numba's functions for the target
+        for folder in (SHIPPED_FOLDER, CACHE_FOLDER):
+            path = self._file(folder, signature, context.codegen())
+            if path is not None:
+                with _warn_on_error("a compiled kernel cannot be read"), contextlib.suppress(FileNotFoundError):
+                    return _rebuild(None, context, pickle.loads(_read_verified(path)))  # noqa: S301 - our own file
         return None
-    folder = Path(numba.config.CACHE_DIR) / file.parent.relative_to(_PACKAGE)  # type: ignore[attr-defined]
+
+    def save_overload(self, signature: Any, kernel: Any) -> None:
+        """Write a compiled kernel. An interrupted process leaves no damaged file."""
+        path = self._file(CACHE_FOLDER, signature, kernel.library.codegen)
+        if path is None or kernel.library.has_dynamic_globals:  # addresses of this process
+            return
+        content: bytes = _dumps(kernel._reduce())  # noqa: SLF001 - as in numba's own cache
+        with _warn_on_error("compiled kernels are not stored"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            new = path.with_name(f"{path.name}.tmp.{os.getpid()}")
+            try:
+                new.write_bytes(content + hashlib.sha256(content).digest())
+                new.replace(path)
+            finally:
+                new.unlink(missing_ok=True)
+
+    def _file(self, folder: Path | None, signature: Any, codegen: Any) -> Path | None:
+        """Return the file of a signature's machine code; None without a folder, or for a function of another package."""
+        if folder is None or self._path is None:
+            return None
+        key = hashlib.sha256(repr((tuple(signature), codegen.magic_tuple())).encode()).hexdigest()[:16]
+        return folder / f"{self._path}.{key}.nbc"
+
+
+def _read_verified(path: Path) -> bytes:
+    """Return the content of a cached kernel without its digest.
+
+    Raises:
+        ValueError: The file was changed after it was written.
+    """
+    stored = path.read_bytes()
+    content, digest = stored[:-DIGEST_BYTES], stored[-DIGEST_BYTES:]
+    if hashlib.sha256(content).digest() != digest:
+        raise ValueError(f"{path.name} is damaged")
+    return content
+
+
+@contextlib.contextmanager
+def _warn_on_error(text: str) -> Iterator[None]:
+    """Turn errors of the cache into warnings: numba then compiles the kernel instead of loading it."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError:
-        return None
-    return str(folder)
-
-
-class _PackageLocator(_CacheLocator):
-    """Place of a kernel of this package in the cache.
-
-    numba's own locators use the absolute path of the source file, so that each installation would compile the kernels again.
-    They also examine the folder again for each kernel of a file.
-    """
-
-    def __init__(self, function: Callable[..., Any], source: str, folder: str) -> None:
-        self._py_file = source  # the name that numba uses in its warnings
-        self._line = function.__code__.co_firstlineno
-        self._folder = folder
-
-    @classmethod
-    def from_function(cls, function: Callable[..., Any], source: str) -> Self | None:
-        """Return the place; None for a function of another package, or if the folder cannot be written."""
-        folder = _kernel_folder(source)
-        return None if folder is None else cls(function, source, folder)
-
-    def get_cache_path(self) -> str:
-        """Return the folder of the source file within the package, below the cache folder."""
-        return self._folder
-
-    def get_source_stamp(self) -> str:
-        """Return the same value for all files, because the name of the cache folder contains the hash of the sources."""
-        return ""
-
-    def get_disambiguator(self) -> str:
-        """Return the line of the function, which distinguishes functions of the same name."""
-        return str(self._line)
+        yield
+    except OSError as error:
+        warnings.warn(f"{text}: {error.strerror}", RuntimeWarning, stacklevel=1)
+    except Exception as error:  # noqa: BLE001 - a damaged file may raise anything
+        warnings.warn(f"{text}: {error!r}", RuntimeWarning, stacklevel=1)
 
 
 @functools.cache
@@ -243,51 +256,6 @@ def _kernel_lock(name: str) -> Iterator[None]:
             fcntl.lockf(_lock_file, fcntl.LOCK_UN, 1, offset)
 
 
-@contextlib.contextmanager
-def _warn_on_cache_error(cache: Any) -> Iterator[None]:
-    """Turn errors of the cache into warnings: numba then compiles the kernel instead of loading it."""
-    try:
-        yield
-    except OSError as error:
-        warnings.warn(f"compiled kernels are not stored: {error.strerror}", RuntimeWarning, stacklevel=1)
-    except Exception as error:  # noqa: BLE001 - a damaged file may raise anything
-        warnings.warn(f"a compiled kernel cannot be read: {error!r}", RuntimeWarning, stacklevel=1)
-        with contextlib.suppress(OSError):
-            cache.flush()  # empties the index, so that the damaged file is not read again
-
-
-def _dump_with_digest(file: Any, kernel: Any) -> bytes:
-    """Serialize a kernel, or the index of a function's kernels, and append a digest."""
-    content: bytes = _numba_dump(file, kernel)
-    return content + hashlib.sha256(content).digest()
-
-
-def _load_verified(file: Any, name: str) -> Any:
-    """Read a cached kernel and verify its digest. The index contains no machine code and is not verified.
-
-    Raises:
-        ValueError: The file was changed after it was written.
-    """
-    stored = Path(file._data_path(name)).read_bytes()  # noqa: SLF001 - as in numba's own method
-    content, digest = stored[:-DIGEST_BYTES], stored[-DIGEST_BYTES:]
-    if hashlib.sha256(content).digest() != digest:
-        raise ValueError(f"{name} is damaged")
-    return _numba_load(file, name)  # unpickling ignores the digest after the pickle
-
-
-def _enable_disk_cache(folder: Path | None) -> None:
-    """Let numba store compiled kernels in ``folder``. Without a folder each process compiles them."""
-    if folder is None:
-        warnings.warn("compiled kernels are not stored: no folder can be written", RuntimeWarning, stacklevel=1)
-        _Dispatcher.enable_caching = lambda _: None
-        return
-    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
-    _CacheImpl._locator_classes.insert(0, _PackageLocator)  # noqa: SLF001 - numba has no public function for it
-    # numba's context manager around each access to the cache; numba's own does nothing except on Windows
-    _Cache._guard_against_spurious_io_errors = _warn_on_cache_error  # noqa: SLF001
-    _CacheFile._dump, _CacheFile._load_data = _dump_with_digest, _load_verified  # noqa: SLF001
-
-
 def _open_lock_file(folder: Path | None) -> BinaryIO | None:
     """Open the file for the locks of kernels; None if there is no cache."""
     if folder is not None:
@@ -296,7 +264,9 @@ def _open_lock_file(folder: Path | None) -> BinaryIO | None:
     return None
 
 
+_DIGEST = source_digest()
+SHIPPED_FOLDER = _PACKAGE / "compiled" / _DIGEST
+"""Read-only folder of the compiled kernels that a package or an image contains. It may not exist."""
 CACHE_FOLDER = _cache_folder()
-"""Folder of compiled kernels; None if no folder can be written."""
+"""Folder of the kernels that this machine compiles; None if no folder can be written."""
 _lock_file = _open_lock_file(CACHE_FOLDER)
-_enable_disk_cache(CACHE_FOLDER)

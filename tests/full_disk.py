@@ -1,5 +1,6 @@
 """Real file system without free space."""
 
+import contextlib
 import os
 import subprocess
 from collections.abc import Iterator
@@ -8,20 +9,26 @@ from pathlib import Path
 import pytest
 
 
-@pytest.fixture
-def full_disk(tmp_path: Path) -> Iterator[Path]:
-    """Mount a full file system and return its folder. Only empty files and folders can be created in it."""
+@contextlib.contextmanager
+def small_disk(disk: Path, size: str) -> Iterator[Path]:
+    """Mount a file system of a size, such as ``4k``, in a new folder, and return the folder."""
     if os.geteuid() != 0:
         pytest.skip("only root can mount a file system")
-    disk = tmp_path / "disk"
     disk.mkdir()
-    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "none", disk], check=False).returncode != 0:
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", disk], check=False).returncode != 0:
         pytest.skip("no file system can be mounted here")
     try:
-        (disk / "file").write_bytes(bytes(4096))
         yield disk
     finally:
         subprocess.run(["umount", "--lazy", disk], check=True)
+
+
+@pytest.fixture
+def full_disk(tmp_path: Path) -> Iterator[Path]:
+    """Mount a full file system and return its folder. Only empty files and folders can be created in it."""
+    with small_disk(tmp_path / "disk", "4k") as disk:
+        (disk / "file").write_bytes(bytes(4096))
+        yield disk
 
 
 @pytest.fixture

@@ -19,8 +19,7 @@ import structlog
 
 from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.private_file import overwrite_private, read_private, write_private
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.lifetime_totals import new_totals
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, new_totals
 
 CHECKSUM_BYTES = 9
 """Length of the first line [bytes]."""

@@ -73,6 +73,10 @@ COMMANDS = {
     "capacity": LazyCommand(
         "bms_estimator.cli.cell.capacity:capacity", "Measure a cell's capacity from rests and the charge between them."
     ),
+    "accuracy": LazyCommand(
+        "bms_estimator.cli.cell.accuracy:accuracy",
+        "Compute how well the SOC of a pack can be known in its use, and which change helps most.",
+    ),
     "cell": LazyCommand(
         "bms_estimator.cli.cell.commands:app",
         "Write a cell file from a pack's learned state, or convert a cell file for PyBaMM, JSON or C.",
@@ -107,6 +111,15 @@ COMMANDS = {
     ),
     "uninstall": LazyCommand(
         "bms_estimator.cli.settings.install:uninstall_command", "Remove the service from this machine."
+    ),
+    "compile": LazyCommand(
+        "bms_estimator.cli.settings.compile:compile_command", "Compile the kernels, so that no later start does."
+    ),
+    "backup": LazyCommand(
+        "bms_estimator.cli.settings.backup:backup", "Write settings and learned state of a pack to an archive."
+    ),
+    "restore": LazyCommand(
+        "bms_estimator.cli.settings.backup:restore", "Restore settings and learned state of a pack from an archive."
     ),
     "config": LazyCommand("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
 }

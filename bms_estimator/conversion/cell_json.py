@@ -30,8 +30,8 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.cell_file import DIGITS
 from bms_estimator.model.config_file import Strict
+from bms_estimator.model.pack_model import DIGITS
 from bms_estimator.version import __version__
 
 PAIR = """\

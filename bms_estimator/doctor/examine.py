@@ -1,20 +1,114 @@
-"""All checks of an installation, in the order of their findings."""
+"""All checks of an installation, in the order of their findings. Those of clock, disk, settings and versions are here."""
 
+import os
+import platform
+import shlex
+import shutil
 from collections.abc import Iterator
 from functools import partial
+from importlib.metadata import version
+from pathlib import Path
 
 from bms_estimator.doctor.broker_check import check_broker
 from bms_estimator.doctor.check import Check, run_checks
-from bms_estimator.doctor.clock_check import check_clock
 from bms_estimator.doctor.device_check import FIRST_SAMPLE_S, check_device
-from bms_estimator.doctor.disk_check import check_disk
-from bms_estimator.doctor.finding import Finding
+from bms_estimator.doctor.finding import Finding, fault, ok, warning
 from bms_estimator.doctor.kernel_check import check_kernels
 from bms_estimator.doctor.port_check import check_port
 from bms_estimator.doctor.service_check import check_service
-from bms_estimator.doctor.settings_check import check_settings
 from bms_estimator.doctor.subject import Subject
-from bms_estimator.doctor.version_check import check_versions
+from bms_estimator.installation import places
+from bms_estimator.installation.root_command import root_command
+from bms_estimator.process.boot_clock import TIMESYNCD, synchronised
+from bms_estimator.service import pack_check
+from bms_estimator.version import __version__
+
+SETTINGS = "settings"
+
+
+def check_settings(subject: Subject) -> Iterator[Finding]:
+    """Yield a summary of the settings, and each likely mistake.
+
+    Raises:
+        UserError: A setting cannot be used.
+    """
+    warnings = pack_check.check_settings(subject.settings, subject.model)
+    yield ok(SETTINGS, f"{subject.path}: {pack_check.summarize(subject.settings, subject.model)}")
+    for text in warnings:
+        yield warning(SETTINGS, text, f"edit {subject.path}, then: bms-estimator config check {subject.path}")
+
+
+DISK = "state folder"
+HISTORY_MB_PER_DAY = 0.2
+"""Size of the history of a day [MB]: 72 MB a year."""
+CHECKPOINTS_MB = 10.0
+"""Size of checkpoints, temporary files and the queue of a short outage [MB]."""
+
+
+def check_disk(subject: Subject) -> Iterator[Finding]:
+    """Yield whether the state folder can be written, and whether the disk has room for the history."""
+    folder = subject.state_folder
+    existing = _nearest_existing(folder)
+    if not os.access(existing, os.R_OK | os.W_OK | os.X_OK):
+        if subject.unit:  # the folder belongs to the service's user
+            yield warning(DISK, f"{folder}: cannot be read by this user; not checked", subject.command_as_root)
+        else:
+            remedy = f"let this user write it: sudo chown {os.geteuid()} {existing}; or set state.folder"
+            yield fault(DISK, f"{existing}: this user may not write it", remedy)
+        return
+    free_mb = shutil.disk_usage(existing).free / 1e6
+    used_mb = _size_mb(folder)
+    needed_mb = CHECKPOINTS_MB + max(HISTORY_MB_PER_DAY * subject.settings.store.history_days - used_mb, 0.0)
+    text = f"{folder}: {used_mb:.0f} MB used, {free_mb:,.0f} MB free"
+    if free_mb < CHECKPOINTS_MB:
+        yield fault(DISK, f"{text}: the disk is full", f"free some space: sudo du -xh {existing} | sort -h | tail")
+    elif free_mb < needed_mb:
+        text += f", but a history of {subject.settings.store.history_days} days needs {needed_mb:,.0f} MB"
+        yield warning(DISK, text, "free some space, or set a smaller store.history_days")
+    else:
+        yield ok(DISK, text)
+
+
+def _nearest_existing(folder: Path) -> Path:
+    """Return the folder, or its nearest parent that exists."""
+    return next(each for each in (folder, *folder.parents) if os.path.lexists(each))
+
+
+def _size_mb(folder: Path) -> float:
+    """Return the size of all files in a folder [MB]; 0 if it does not exist."""
+    return sum(file.stat().st_size for file in folder.glob("*") if file.is_file()) / 1e6
+
+
+PACKAGES = ("numba", "numpy", "aiomqtt", "pydantic", "pyserial")
+"""Packages whose versions are reported."""
+
+
+def check_versions() -> Iterator[Finding]:
+    """Yield the versions."""
+    packages = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
+    system = f"{platform.system()} {platform.release()} {platform.machine()}"
+    yield ok("versions", f"bms-estimator {__version__}, Python {platform.python_version()}, {packages}, {system}")
+
+
+CLOCK = "clock"
+REAL_TIME_CLOCK = Path("/dev/rtc0")
+"""Clock with a battery."""
+
+
+def check_clock(subject: Subject | None) -> Iterator[Finding]:
+    """Yield whether the clock is synchronized, and whether the service can detect that."""
+    hardware = "a clock with a battery" if REAL_TIME_CLOCK.exists() else "no clock with a battery"
+    if synchronised():
+        yield ok(CLOCK, f"synchronized; {hardware}")
+    else:
+        text = f"not synchronized; {hardware}: the length of a power-off counts as unknown"
+        yield warning(CLOCK, text, "sudo timedatectl set-ntp true; in a container: synchronize the host")
+    if subject and subject.unit and synchronised() and not TIMESYNCD.exists():
+        drop_in = places.clock_drop_in(places.TEMPLATE if "@" in subject.unit.name else places.UNIT)
+        if not drop_in.exists():
+            text = "the service cannot see that the clock is synchronized, because systemd-timesyncd does not run"
+            yield warning(CLOCK, text, f"{shlex.join(root_command('install'))}, which adds {drop_in.name} to the unit")
+
 
 CLOSING_S = 4.0
 """Time to close a device [s]."""

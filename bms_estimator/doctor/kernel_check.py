@@ -8,17 +8,20 @@ from pathlib import Path
 from bms_estimator.doctor.finding import Finding, ok, warning
 from bms_estimator.doctor.subject import Subject
 from bms_estimator.installation.root_command import root_command
-from bms_estimator.numba_cache import cache_folders, source_digest
+from bms_estimator.numba_cache import SHIPPED_FOLDER, cache_folders, source_digest
+from bms_estimator.process.memory import available_bytes
+from bms_estimator.service.kernel_compilation import CHILD_BYTES, COMPLETE_FILE
 
 NAME = "kernel cache"
-STEP_KERNELS = "kernels/step.*.nbi"
-"""Pattern of the files of the estimator's step, which is compiled last."""
 MAX_OTHER_VERSIONS = 3
 """Maximum number of folders with kernels of other versions without a warning. Each may take more than 100 MB."""
 
 
 def check_kernels(subject: Subject | None) -> Iterator[Finding]:
     """Yield whether kernels are compiled, and whether they can be stored."""
+    if (SHIPPED_FOLDER / COMPLETE_FILE).exists():
+        yield ok(NAME, f"{SHIPPED_FOLDER}: compiled kernels of the package")
+        return
     folder = (subject and subject.unit_cache_folder) or _own_cache_folder()
     if folder is None:
         text = "no folder can be written: every start compiles the kernels, which may take minutes"
@@ -29,11 +32,16 @@ def check_kernels(subject: Subject | None) -> Iterator[Finding]:
         yield warning(NAME, f"{folder}: cannot be read by this user; not checked", _command_as_root(subject))
         return
     size_mb = size_of(version_folder) / 1e6
-    if any(version_folder.glob(STEP_KERNELS)):
+    if (version_folder / COMPLETE_FILE).exists():
         yield ok(NAME, f"{version_folder}: compiled, {size_mb:.0f} MB")
     else:
         text = f"{version_folder}: not compiled yet: the first start may take minutes"
-        yield warning(NAME, text, "start the service, or run any replay, once")
+        yield warning(NAME, text, "start the service, or run once: bms-estimator compile")
+        if (available := available_bytes()) < CHILD_BYTES:
+            text = f"compiling needs {CHILD_BYTES >> 20} MiB of memory, and {available >> 20} MiB are available"
+            yield warning(
+                NAME, text, "end other programs, add swap, or install the Debian package, which compiles nothing"
+            )
     other_versions = [each for each in folder.iterdir() if each.is_dir() and each != version_folder]
     if len(other_versions) > MAX_OTHER_VERSIONS:
         command = f"find {folder} -mindepth 1 -maxdepth 1 ! -name {version_folder.name} -exec rm -r {{}} +"

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from bms_estimator.doctor.finding import Finding, fault, ok, warning
 from bms_estimator.doctor.subject import Subject
 from bms_estimator.doctor.systemd_unit import SystemdUnit
+from bms_estimator.process.memory import has_memory_groups
 
 NAME = "service"
 INVALID_SETTING = 2
@@ -23,6 +24,11 @@ def check_service(subject: Subject) -> Iterator[Finding]:
             yield warning(NAME, text, f"{subject.install_command}; or: bms-estimator run {subject.path}")
         return
     yield describe_unit(unit)
+    if not has_memory_groups():
+        text = f"the kernel limits no memory: MemoryMax of {unit.name} has no effect"
+        yield warning(
+            NAME, text, "on a Raspberry Pi, append cgroup_enable=memory to /boot/firmware/cmdline.txt, and reboot"
+        )
     if not unit.is_enabled:
         text = f"{unit.name}: does not start with the machine"
         yield warning(NAME, text, f"sudo systemctl enable {unit.name}")

@@ -1,11 +1,14 @@
-"""Settings record of the anchors (ends of charge and discharge) from cell file and settings."""
+"""Ends of charge and discharge: settings record of the anchors, and generic curves between the voltages of these ends."""
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.kernels.kalman_filter.anchors import ANCHOR_SETTINGS, FULL_STD
-from bms_estimator.model.cell import CellModel
-from bms_estimator.settings.charge_limits import ChargeLimits
+from bms_estimator.kernels.kalman_filter.ekf import INDEPENDENT_R_STD
+from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.monotone_cubic import MonotoneCubic
+from bms_estimator.settings.sampling import ChargeLimits
 
 VOLTAGE_ERROR = 0.005
 """Relative error of the voltage of charger and source. A BMS seldom measures the voltage of a pack more accurately."""
@@ -31,6 +34,41 @@ MIN_FULL_SOC = 0.98
 """Minimum SOC of the OCV curve at the full voltage for a correction of the filter: 2 std of the anchor below 1."""
 MAX_EMPTY_SOC = 0.05
 """Maximum SOC of the OCV curve at the cut-off voltage for a correction of the filter: 1.5 std of the anchor at 25 C."""
+MIN_USED_SOC = 0.5
+"""Minimum SOC of a generic curve between the configured voltages. With less they are rather those of another pack or unit."""
+
+
+def between_limits(pack: CellModel, limits: ChargeLimits) -> CellModel:
+    """Return a generic model with SOC 0 and 1 at the configured voltages of protection and charger.
+
+    The declared capacity is that between these voltages. The file of a measured cell remains unchanged, because its capacity belongs
+    to its own ends.
+    """
+    ocv, ladder = pack.ocv, pack.ladder
+    if ladder is None or ladder.std <= INDEPENDENT_R_STD or not isinstance(ocv, TableOcv):
+        return pack
+    curve = MonotoneCubic(ocv.soc, ocv.ocv_v)(np.linspace(0.0, 1.0, OCV_POINTS))
+    low, high = soc_at_cutoff(curve, limits), soc_at_full(curve, limits)
+    if high - low < MIN_USED_SOC or high - low == 1.0:
+        return pack
+    soc = np.array([0.0, *(s for s in (np.array(ocv.soc) - low) / (high - low) if 0.0 < s < 1.0), 1.0])
+    at = low + (high - low) * soc
+    columns = {
+        name: tuple(np.interp(at, ocv.soc, column).tolist())
+        for name in ("error_v", "hysteresis_v", "per_kelvin_v")
+        if (column := getattr(ocv, name)) is not None
+    }
+    new_ocv = ocv.model_copy(
+        update={"soc": tuple(soc.tolist()), "ocv_v": tuple(MonotoneCubic(ocv.soc, ocv.ocv_v)(at).tolist()), **columns}
+    )
+    ladder_soc = np.linspace(0.0, 1.0, len(ladder.soc))
+    at = low + (high - low) * ladder_soc
+    rows = {
+        name: tuple(tuple(np.interp(at, ladder.soc, row).tolist()) for row in getattr(ladder, name))
+        for name in ("weak_ohm", "strong_ohm")
+    }
+    new_ladder = ladder.model_copy(update={"soc": tuple(ladder_soc.tolist()), **rows})
+    return pack.model_copy(update={"ocv": new_ocv, "ladder": new_ladder})
 
 
 def anchor_settings(

@@ -7,25 +7,26 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.estimator.anchor_settings import between_limits
 from bms_estimator.estimator.curve_change import return_to_cell_file, use_curves
 from bms_estimator.estimator.fitted_state import FittedState, write_fitted_state
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, add_reference, complete_row
-from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR
+from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR, apply_prior
 from bms_estimator.kernels.kalman_filter.hypotheses import USER_SOC_STD, set_soc, weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sampling import BOARD, EXACT, Sampling
+from bms_estimator.settings.sampling import BOARD, EXACT, NO_LIMITS, ChargeLimits, Sampling
 
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
@@ -76,9 +77,9 @@ class Estimator:
         sampling: Sampling = EXACT,
         limits: ChargeLimits = NO_LIMITS,
     ) -> None:
-        self.cell = cell
+        self.cell = between_limits(cell, limits) if isinstance(cell, CellModel) else cell
         self.settings_record = estimator_settings(
-            cell,
+            self.cell,
             observer or ObserverSettings(),
             identifier or IdentifierSettings(enabled=False),
             voltage_resolution_v=voltage_resolution_v,
@@ -185,6 +186,13 @@ class Estimator:
                 # no previous sample: if the sensor freezes now, the SOC before this call must not be restored
                 c["last_v"] = 0.0
             store_last_good_state(c, f)
+
+    def add_prior(self, soc: float, std: float) -> None:
+        """Correct the SOC of a new pack by the SOC 0..1 that its device reports, with a std. Call this after the first sample."""
+        f, c = self.record[0]["filter"], self.record[0]["checks"]
+        apply_prior(f, soc, std)
+        self.state["soc"] = f["soc"]
+        store_last_good_state(c, f)
 
     def use_curves(self, settings: np.void) -> None:
         """Use the curves of another record of dtype EKF_SETTINGS. R_s in ohm does not change."""

@@ -5,7 +5,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bms_estimator.estimator.anchor_settings import MAX_EMPTY_SOC, MIN_FULL_SOC, soc_at_cutoff, soc_at_full
+from bms_estimator.estimator.anchor_settings import (
+    MAX_EMPTY_SOC,
+    MIN_FULL_SOC,
+    between_limits,
+    soc_at_cutoff,
+    soc_at_full,
+)
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
@@ -116,7 +122,8 @@ def _missing_parallel(settings: Settings, cell: CellModel) -> str | None:
 
 
 def _full_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None:
-    ocv_v, limits = ocv_grid(cell)[0], settings.charge_limits
+    limits = settings.charge_limits
+    ocv_v = ocv_grid(between_limits(cell, limits))[0]
     soc = soc_at_full(ocv_v, limits)
     if soc >= MIN_FULL_SOC:
         return None
@@ -128,7 +135,8 @@ def _full_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None:
 
 
 def _cutoff_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None:
-    ocv_v, limits = ocv_grid(cell)[0], settings.charge_limits
+    limits = settings.charge_limits
+    ocv_v = ocv_grid(between_limits(cell, limits))[0]
     soc = soc_at_cutoff(ocv_v, limits)
     if soc <= MAX_EMPTY_SOC:
         return None

@@ -24,9 +24,8 @@ from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.monotone_cubic import MonotoneCubic
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.settings.charge_limits import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.observer import SCHEME_2_EPSILON, SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
-from bms_estimator.settings.sampling import EXACT, Sampling
+from bms_estimator.settings.sampling import EXACT, NO_LIMITS, ChargeLimits, Sampling
 
 MEMORY_S = 60.0
 """Time constant with which the learning law of a stack discounts data [s]. Water and gas supply change within a minute."""

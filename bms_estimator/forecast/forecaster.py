@@ -14,8 +14,7 @@ from bms_estimator.forecast.available_power import PowerLimits, PresentPower, ce
 from bms_estimator.forecast.capability import projected_pack, write_capability
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve, ForecastRows, unknown_values
 from bms_estimator.forecast.given_load import GivenLoad
-from bms_estimator.forecast.load_history import LoadHistory, load_spread
-from bms_estimator.forecast.past_minutes import MINUTE_S, PastMinutes
+from bms_estimator.forecast.load_history import MINUTE_S, LoadHistory, PastMinutes, load_spread
 from bms_estimator.forecast.projection import (
     Projection,
     discharges,

@@ -1,14 +1,60 @@
-"""Installation and upgrade of the service."""
+"""Installation, upgrade and removal of the service: its units, drop-ins, udev rule and user."""
 
 import os
+import shutil
+import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from bms_estimator.installation import places
 from bms_estimator.installation.machine import Machine, read_file, run, tree
-from bms_estimator.installation.system_files import SYSUSERS_LINES, system_files
+from bms_estimator.installation.program_copy import is_program_copy
 from bms_estimator.model.errors import UserError
+
+FILES = Path(__file__).parent / "files"
+"""Folder with the original files."""
+SYSUSERS_LINES = (f'u {places.NAME} - "Battery estimator" {places.STATE}', f"m {places.NAME} dialout")
+"""Lines for systemd-sysusers that create the user of the service. Members of the group dialout may open serial ports."""
+UNIT_PROGRAM = "/opt/bms-estimator/bin/bms-estimator"
+"""Program in the original unit, which is replaced by the installed program."""
+
+
+@dataclass(frozen=True)
+class SystemFile:
+    """File to be written.
+
+    Attributes:
+        kind: Kind of the file, for the output of ``install``.
+        path: Absolute path on the machine.
+        text: Content.
+    """
+
+    kind: str
+    path: Path
+    text: str
+
+
+def system_files(machine: Machine, program: Path) -> list[SystemFile]:
+    """Return the files that the service needs on a machine.
+
+    Args:
+        machine: Machine of the service.
+        program: Absolute path of the program on the machine.
+    """
+    unit = (FILES / "bms-estimator.service").read_text(encoding="utf-8").replace(UNIT_PROGRAM, str(program))
+    template = unit.replace(str(places.PACK_FILE), f"{places.SETTINGS}/%i.toml")
+    rule = (FILES / "99-bms-estimator.rules").read_text(encoding="utf-8")
+    files = [
+        SystemFile("unit", places.UNIT, unit),
+        SystemFile("unit", places.TEMPLATE, template),
+        SystemFile("udev rule", places.UDEV_RULE, rule),
+    ]
+    if any(machine.path(daemon).exists() for daemon in places.CLOCK_DAEMONS):
+        drop_in = (FILES / "clock.conf").read_text(encoding="utf-8")
+        files += [SystemFile("unit", places.clock_drop_in(unit), drop_in) for unit in (places.UNIT, places.TEMPLATE)]
+    return files
+
 
 UDEV_CONTROL = Path("/run/udev/control")
 """Socket of udev, which does not run in containers."""
@@ -54,6 +100,7 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
         raise UserError(f"systemd-sysusers did not create the group {places.NAME}")
     report("user", f"{places.NAME}, in group dialout")
     if pack is not None:
+        _require_same_pack(machine, pack)
         _write_settings(machine, pack, group, report)
     _set_settings_group(machine, group)
     for file in system_files(machine, program):
@@ -109,6 +156,35 @@ def _link_program(machine: Machine, program: Path, report: Report) -> None:
     report("program", f"{places.PROGRAM_LINK}, a link to {program}")
 
 
+def _require_same_pack(machine: Machine, pack: PackFiles) -> None:
+    """Refuse to replace the settings of another pack.
+
+    Raises:
+        UserError: The installed settings are of another pack. The message has the commands that install this one beside it.
+    """
+    installed = machine.read(places.PACK_FILE)
+    before = installed and _pack_name(installed)
+    name = _pack_name(pack.settings.read_bytes())
+    if before and before != name:
+        target = places.SETTINGS / f"{name}.toml"
+        files = " ".join(map(str, pack.named))
+        copy = f"\n  sudo install -m 640 -g {places.NAME} {files} {places.SETTINGS}" if files else ""
+        raise UserError(
+            f"{places.PACK_FILE}: is the pack {before}, and {pack.settings} is {name}; to run both:{copy}\n"
+            f"  sudo install -m 640 -g {places.NAME} {pack.settings} {target}\n"
+            f"  sudo systemctl enable --now {places.NAME}@{name}\n"
+            f"to replace {before}, remove {places.PACK_FILE} first"
+        )
+
+
+def _pack_name(settings: bytes) -> str | None:
+    """Return the name of the pack in settings; None if they cannot be read."""
+    try:
+        return str(tomllib.loads(settings.decode()).get("pack", {}).get("name", "pack"))
+    except ValueError:
+        return None
+
+
 def _write_settings(machine: Machine, pack: PackFiles, group: int, report: Report) -> None:
     """Copy a pack file and the files that it names. Back up each installed file that differs."""
     files = {places.SETTINGS / file.name: read_file(file) for file in pack.named}
@@ -135,3 +211,77 @@ def _is_enabled(machine: Machine) -> bool:
     """Return True if the service starts with the machine."""
     folders = machine.path(places.UNIT).parent.glob("*.wants")
     return any((folder / places.UNIT.name).is_symlink() for folder in folders)
+
+
+def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
+    """Stop the service, and remove its files and its user.
+
+    Args:
+        machine: Machine of the service.
+        purge: Also remove settings, drop-ins and state.
+        report: Called after each step.
+
+    Returns:
+        Absolute paths of folders and programs that remain.
+
+    Raises:
+        UserError: A program of the system is missing or fails.
+    """
+    all_units = places.UNIT, places.TEMPLATE
+    units = [unit for unit in all_units if machine.path(unit).exists()]
+    if units:
+        if machine.is_running:
+            run(["systemctl", "stop", places.UNIT.name, OTHER_PACKS])
+        machine.run("systemctl", "disable", "--quiet", *(unit.name for unit in units))
+        report("service", "stopped and disabled")
+    drop_ins = [places.drop_ins(unit) for unit in all_units]
+    user_data = [*drop_ins, places.SETTINGS, places.STATE]
+    for name in (*all_units, *map(places.clock_drop_in, all_units), places.UDEV_RULE, places.CACHE):
+        _remove(machine, name, report)
+    for name in user_data if purge else ():
+        _remove(machine, name, report)
+    for folder in drop_ins:
+        _remove_if_empty(machine.path(folder))
+    if machine.is_running:
+        reload_system()
+    for name in user_data:
+        _give_to_root(machine.path(name))
+    _remove_user(machine, report)
+    if machine.path(places.PROGRAM_LINK).is_symlink():
+        _remove(machine, places.PROGRAM_LINK, report)
+    if is_program_copy(machine.path(places.PROGRAM_COPY)):
+        _remove(machine, places.PROGRAM_COPY, report)
+    return [name for name in user_data if machine.path(name).exists()]
+
+
+def _remove(machine: Machine, name: Path, report: Report) -> None:
+    """Remove a file or a folder, if it exists."""
+    path = machine.path(name)
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    elif path.is_symlink() or path.exists():
+        path.unlink()
+    else:
+        return
+    report("removed", str(name))
+
+
+def _remove_user(machine: Machine, report: Report) -> None:
+    """Remove the user and its group. Whether ``userdel`` also removes the group depends on the distribution."""
+    if machine.group_id(places.NAME) is None:
+        return
+    machine.run("userdel", places.NAME, root_option="--prefix")
+    if machine.group_id(places.NAME) is not None:
+        machine.run("groupdel", places.NAME, root_option="--prefix")
+    report("removed", f"user {places.NAME}")
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _give_to_root(folder: Path) -> None:
+    """Make root the owner of a remaining folder, because a new user may get the id of the removed user."""
+    for path in tree(folder) if folder.exists() else ():
+        os.chown(path, 0, 0, follow_symlinks=False)

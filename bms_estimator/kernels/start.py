@@ -61,8 +61,8 @@ def restart_filter(s: Record, p: Record, gap_s: float, current_a: float, voltage
     else:
         merge_all(f)
         begin_gap(f, p.filter, gap_s)
-        rested = gap_s < math.inf and is_resting(f, p.filter)
-        propagate_over_gap(f, p.filter, gap_s, rested)
+        rested = is_resting(f, p.filter)
+        propagate_over_gap(f, p.filter, gap_s)
         spawn_after_gap(f, p.filter, gap_s, rested)
     reset_window(f)
     continue_over_gap(s.anchors, p.anchors, f, p.filter, gap_s, current_a, voltage_v)
@@ -74,8 +74,8 @@ def restart_filter(s: Record, p: Record, gap_s: float, current_a: float, voltage
 
 
 @njit(cache=True)
-def propagate_over_gap(f: Record, p: Record, gap_s: float, rested: bool) -> None:
-    """Propagate hypothesis 0 over a gap with the usual load and, if ``rested``, hypothesis 1 without a load.
+def propagate_over_gap(f: Record, p: Record, gap_s: float) -> None:
+    """Propagate hypothesis 0 over a gap with the usual load, and hypothesis 1 without a load.
 
     After a gap of unknown duration, SOC and polarization are unknown. ``f`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
     """
@@ -84,15 +84,13 @@ def propagate_over_gap(f: Record, p: Record, gap_s: float, rested: bool) -> None
         forget_state_of_charge(f, p, 0)
         set_initial_soc(f, p, 0, f.soc, MAX_SOC_STD_AFTER_GAP)
         return
-    if rested:
-        copy_hypothesis(f, 0, 1)
+    copy_hypothesis(f, 0, 1)
     prepare_transition(f, p)
     predict(f, p, 0)
     limit_soc_std(f, 0, MAX_SOC_STD_AFTER_GAP)
-    if rested:
-        w = f.window
-        w.charge_as = w.throughput_as = w.unknown_as = 0.0
-        predict(f, p, 1)
+    w = f.window
+    w.charge_as = w.throughput_as = w.unknown_as = 0.0
+    predict(f, p, 1)
 
 
 @njit(cache=True)

@@ -36,6 +36,10 @@ class Entity(NamedTuple):
     state_class: str | None = "measurement"
     signed: bool = False
     """True if the sign depends on the configured direction of positive current."""
+    icon: str | None = None
+    """Name of the icon in Material Design Icons; None: that of the device class."""
+    factor: float = 1.0
+    """Factor from the field of the payload to the entity's unit."""
     immediate_step: float = math.inf
     """Minimum change that is published at once, for example after a user has set the SOC."""
 

@@ -20,7 +20,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, PublishRejection, ReceivedMessage
 from bms_estimator.mqtt.message import Message
-from bms_estimator.mqtt.reason_codes import UNSUPPORTED_VERSION, describe_reason, is_final
+from bms_estimator.mqtt.reason_codes import LOGIN, UNSUPPORTED_VERSION, describe_reason, is_final
 from bms_estimator.mqtt.receive_queue import ReceiveQueue
 
 DISCONNECT_TIMEOUT_S = 1.0
@@ -284,6 +284,11 @@ def failure_reason(error: aiomqtt.MqttError, section: str) -> str:
     if isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode):
         return describe_reason(error.rc, section)
     return str(error)
+
+
+def is_login_error(error: aiomqtt.MqttError) -> bool:
+    """Return True if the broker rejects user name and password, or requires them."""
+    return isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode) and error.rc.value in LOGIN
 
 
 def should_retry_with_v311(error: aiomqtt.MqttError) -> bool:

@@ -16,6 +16,10 @@ class BrokerConnectionError(Exception):
     """
 
 
+class LoginError(BrokerConnectionError):
+    """The broker rejects the user name and the password, or requires them."""
+
+
 class ReceivedMessage(NamedTuple):
     """Received message."""
 

@@ -15,10 +15,11 @@ from bms_estimator.mqtt.client import (
     Client,
     Timeouts,
     failure_reason,
+    is_login_error,
     open_client,
     should_retry_with_v311,
 )
-from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
+from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, LoginError
 from bms_estimator.settings.broker import BrokerSettings
 
 
@@ -51,7 +52,8 @@ class BrokerConnector:
             except UserError as error:
                 raise BrokerConnectionError(str(error)) from None
             except aiomqtt.MqttError as error:
-                raise BrokerConnectionError(failure_reason(error, self._settings.section)) from None
+                kind = LoginError if is_login_error(error) else BrokerConnectionError
+                raise kind(failure_reason(error, self._settings.section)) from None
             yield client
 
     async def _connect(

@@ -23,6 +23,9 @@ HINTS = {
 }
 """Causes and remedies by reason code. ``section`` is the settings section of the broker."""
 
+LOGIN = {134, 135}
+"""Reason codes of a rejected connection with a wrong or missing user name or password."""
+
 FINAL = {
     135,  # not authorized
     144,  # topic name invalid

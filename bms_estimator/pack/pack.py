@@ -16,11 +16,12 @@ from bms_estimator.estimator.restore import restore_state
 from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.forecast.saved_load import restore_load
+from bms_estimator.forecast.load_history import restore_load
 from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, NO_SOC, CellBlock, SampleBlock
 from bms_estimator.pack.declared_capacity import with_capacity
 from bms_estimator.pack.state import (
     CAPACITY,
@@ -40,6 +41,8 @@ from bms_estimator.pack_model.learning import FIT_INTERVAL_S, SlowFit, Submit, r
 from bms_estimator.pack_model.saved import fit_of_curves, history_of
 from bms_estimator.settings.pack import Settings
 
+PRIOR_S = 600.0
+"""Time from the first sample of a new pack within which the SOC that its device reports is used as a prior [s]."""
 T = TypeVar("T")
 
 
@@ -70,6 +73,7 @@ class Pack:
         cells: Estimators of the single cells; None: none.
         forecaster: Forecaster; None: there are no forecasts.
         has_forecasts: False: the observed load is kept, but no forecasts are made at intervals.
+        device_soc_std: Std of the SOC that the device reports, which is the prior of a new pack; None: it is not used.
     """
 
     def __init__(
@@ -80,7 +84,10 @@ class Pack:
         forecaster: Forecaster | None = None,
         *,
         has_forecasts: bool = True,
+        device_soc_std: float | None = None,
     ) -> None:
+        self._device_soc_std = device_soc_std  # None also after the prior was used, or its time has passed
+        self._first_s = math.nan  # time of the first sample, if the device's SOC is awaited
         self.estimator, self.slow_fit, self.cells, self.forecaster = estimator, slow_fit, cells, forecaster
         self._has_forecasts = has_forecasts and forecaster is not None
         self._has_cells = False  # of the present block
@@ -103,12 +110,13 @@ class Pack:
             if self.cells:
                 self.cells.extend_gap(wait_s)
 
-    def run(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS) -> Step:
+    def run(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS, device_soc: Floats = NO_SOC) -> Step:
         """Process a block of samples.
 
         Args:
             samples: Samples, shape (n,), dtype ``SAMPLE``.
             cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
+            device_soc: SOC by the device at the samples, 0..1, shape (n,); empty without any.
         """
         self._has_cells = cells_v.size > 0 or (self.cells is not None and self.cells.cells.size > 0)
         if self._trace.size < samples.size:
@@ -117,7 +125,7 @@ class Pack:
         while start < samples.size:
             due = forecaster.first_due(samples["time_s"][start:]) if forecaster and self._has_forecasts else None
             end = samples.size if due is None else start + due + 1
-            begin, rows = rows, self._run_estimates(samples[start:end], cells_v[start:end], rows)
+            begin, rows = rows, self._run_estimates(samples[start:end], cells_v[start:end], device_soc[start:end], rows)
             if forecaster:
                 forecaster.add(self._trace[begin:rows], self.cells.deviations if self.cells else None)
             if forecaster and self._has_forecasts:
@@ -132,21 +140,38 @@ class Pack:
             forecaster.past.add(forecaster.load)
         return Step(self._trace[:rows], tuple(forecasts))
 
-    def _run_estimates(self, samples: SampleBlock, cells_v: CellBlock, rows: int) -> int:
+    def _run_estimates(self, samples: SampleBlock, cells_v: CellBlock, device_soc: Floats, rows: int) -> int:
         """Run estimator, single cells and slow fit. Append the estimates to the trace, and return its new length.
 
         The single cells run before a fit is adopted, so that they see the curves in force at their samples.
         """
         start = 0
         while start < samples.size:
-            used, written = self.estimator.run_part(samples[start:], self._trace[rows:])
+            prior = self._prior_index(samples[start:], device_soc[start:])
+            stop = samples.size if prior is None else start + prior + 1
+            used, written = self.estimator.run_part(samples[start:stop], self._trace[rows:])
             end, trace = start + used, self._trace[rows : rows + written]
             if self._has_cells and self.cells:  # the call would take a tenth of the time of a single sample
                 self.cells.run(samples[start:end], cells_v[start:end], trace)
             if self.slow_fit:
                 self.slow_fit.advance()
+            if prior is not None and end == stop and self._device_soc_std and self.estimator.state["started"][0]:
+                self.estimator.add_prior(float(device_soc[end - 1]), self._device_soc_std)
+                self._device_soc_std = None
             start, rows = end, rows + written
         return rows
+
+    def _prior_index(self, samples: SampleBlock, device_soc: Floats) -> int | None:
+        """Return the index of the first sample of a new pack with an SOC by the device; None if no prior is due."""
+        if self._device_soc_std is None:
+            return None
+        self._first_s = float(samples["time_s"][0]) if math.isnan(self._first_s) else self._first_s
+        known = np.flatnonzero(~np.isnan(device_soc))
+        if known.size and float(samples["time_s"][known[0]]) - self._first_s <= PRIOR_S:
+            return int(known[0])
+        if float(samples["time_s"][-1]) - self._first_s > PRIOR_S:
+            self._device_soc_std = None
+        return None
 
     def restore(self, state: PackState, gap_s: float) -> dict[str, str]:
         """Restore the state of an earlier run, before the first sample. A part that is refused begins empty.
@@ -210,7 +235,7 @@ class Pack:
         if reason := restore_state(self.estimator, state.record, gap_s):
             outcomes[CHECKPOINT] = f"{REFUSED}{reason}"
             return False
-        soc = self.estimator.soc
+        soc, self._device_soc_std = self.estimator.soc, None
         outcomes[CHECKPOINT] = "restored" if math.isnan(soc) else f"restored: SOC {soc:.4f}"
         if CAPACITY in outcomes:
             outcomes[CAPACITY] += (
@@ -300,4 +325,12 @@ def assemble(
     if has_load and estimator.identifying and isinstance(model, CellModel):
         cutoff_v = load_cutoff_v(settings, model)
         forecaster = Forecaster(estimator, cutoff_v=cutoff_v, limits=power_limits(settings, model))
-    return Pack(estimator, slow_fit, CellEstimator(estimator), forecaster, has_forecasts=has_forecasts)
+    device_soc_std = settings.pack.device_soc_std if estimator.identifying and isinstance(model, CellModel) else None
+    return Pack(
+        estimator,
+        slow_fit,
+        CellEstimator(estimator),
+        forecaster,
+        has_forecasts=has_forecasts,
+        device_soc_std=device_soc_std,
+    )

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.store.history import MINUTE_S
 from bms_estimator.store.history_reader import HistoryReader
-from bms_estimator.store.minute import MINUTE_S
 
 MAX_EVENTS = 50
 """Maximum number of events in a response; the latest are sent."""

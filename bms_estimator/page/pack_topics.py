@@ -9,7 +9,7 @@ from typing import Any
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
-from bms_estimator.store.minute import epoch_s
+from bms_estimator.store.history import epoch_s
 
 PACKS = "packs"
 """Key of the names of all packs and of the number of packs that are not shown."""

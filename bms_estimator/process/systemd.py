@@ -3,10 +3,13 @@
 import os
 import socket
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 CREDENTIALS = Path("/run/credentials")
 """Folder with the credentials of all systemd units."""
+EXTENSION_S = 120
+"""Extension of the start timeout [s]."""
 
 
 class SystemdNotifier:
@@ -28,8 +31,7 @@ class SystemdNotifier:
         self._packs, self._activity = frozenset(packs), activity
         self._awaited: dict[str, set[str]] = {}
         self._texts = dict.fromkeys(packs, "")
-        address = environment.get("NOTIFY_SOCKET", "")
-        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._socket = environment.get("NOTIFY_SOCKET", "")
         is_watched = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         self.watchdog_s = float(environment.get("WATCHDOG_USEC", "0")) / 1e6 if is_watched else 0.0
         """Watchdog timeout of systemd [s]; 0: no watchdog."""
@@ -41,7 +43,7 @@ class SystemdNotifier:
     def status(self, pack: str, text: str) -> None:
         """Set the pack's status text for ``systemctl status``."""
         self._texts[pack] = text
-        self._send(self._status)
+        _send(self._socket, self._status)
 
     def alive(self, pack: str) -> None:
         """Report that the pack's loop is alive."""
@@ -62,18 +64,21 @@ class SystemdNotifier:
         awaited.discard(pack)
         if not awaited:
             del self._awaited[state]
-            self._send(f"{state}{suffix}")
+            _send(self._socket, f"{state}{suffix}")
 
-    def _send(self, state: str) -> None:
-        """Send to systemd; ignore errors, because the service works without it."""
-        if not self._address:
-            return
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel:
-            channel.setblocking(False)
-            try:
-                channel.sendto(state.encode(), self._address)
-            except OSError:
-                return
+
+def extend_start(status: str) -> None:
+    """Extend the start timeout of the systemd unit by ``EXTENSION_S``, and set its status text."""
+    _send(os.environ.get("NOTIFY_SOCKET", ""), f"EXTEND_TIMEOUT_USEC={EXTENSION_S * 10**6}\nSTATUS={status}")
+
+
+def _send(address: str, state: str) -> None:
+    """Send a state to the socket of systemd; ignore errors, because the service works without it."""
+    if not address:
+        return
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel, suppress(OSError):
+        channel.setblocking(False)
+        channel.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
 def credential(name: Path) -> Path:

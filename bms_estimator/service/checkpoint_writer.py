@@ -14,7 +14,7 @@ import structlog
 
 from bms_estimator.checkpoint.run_file import RunCounters
 from bms_estimator.checkpoint.state_files import StateFiles
-from bms_estimator.forecast.saved_load import load_arrays
+from bms_estimator.forecast.load_history import load_arrays
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack.state import REFUSED
@@ -24,8 +24,7 @@ from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.telemetry.alarms.evaluator import INPUTS, PENDING, PROBES, SILENCE, AlarmEvaluator
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
-from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals
 
 SOC_CHANGE = 0.002
 """Change of the SOC that triggers a save. If the service is killed, no larger change is lost."""

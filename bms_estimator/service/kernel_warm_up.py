@@ -19,14 +19,16 @@ from bms_estimator.pack_model.fit import fit
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import neutral_fit
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
-from bms_estimator.service.kernel_subtrees import CELL, second_process
+from bms_estimator.service.kernel_compilation import compile_kernels
 from bms_estimator.settings.alarm_limits import MIN_CELLS
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 
+CELL = "chen_mora"
+"""Cell file of the warm-up. Any file would do, because the kernels do not depend on the cell."""
 WARM_UP_S = 330
 """Duration of the load with which the kernels of a forecast are called [s], longer than ``forecaster.MIN_LOAD_S``."""
 COLLECT_AFTER = 50_000
@@ -34,12 +36,12 @@ COLLECT_AFTER = 50_000
 
 
 def load_kernels() -> None:
-    """Load the kernels of decoder, estimator and reports; a first start compiles them, in two processes."""
+    """Load the kernels of decoder, estimator and reports. A first start compiles them."""
+    compile_kernels()
     thresholds = gc.get_threshold()
     gc.set_threshold(COLLECT_AFTER)
     try:
-        with second_process():
-            _call_kernels()
+        _call_kernels()
     finally:
         gc.set_threshold(*thresholds)
     gc.collect()
@@ -58,6 +60,7 @@ def _call_kernels() -> None:
     known_rows(trace, False)
     pack = cell.pack(MIN_CELLS, 1)
     CellEstimator(new_estimator(Settings(), pack)).run(sample, np.zeros((1, MIN_CELLS)), trace)
+    estimator.add_prior(0.5, 0.1)
     estimator.set_soc(0.5)
     estimator.resume(0.0)
     make_parameters_payload(estimator, 0.0)

@@ -252,7 +252,7 @@ async def _estimate(
         if edge:
             edge.take(received.samples, received.cells_v)
         publisher.alarm_monitor.check_silence()
-        step = pack.run(received.samples, received.cells_v)
+        step = pack.run(received.samples, received.cells_v, received.device_soc)
         totals.add(step.trace)
         try:
             # the sinks send now, so that the alarms do not delay them and a source that always has a block does not starve them

@@ -37,6 +37,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.exports.influx import InfluxSink
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
+from bms_estimator.sinks.mqtt.venus_os import configured_limits
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.factory import open_line_source
@@ -113,6 +114,7 @@ async def run_pack_service(
             sample_period_s=settings.sensor.sample_period_s,
             home_assistant=settings.home_assistant,
             alarms=[each.name for each in monitored_alarms(settings, cell)],
+            venus_limits=configured_limits(settings.pack) if settings.mqtt.profile == "venus-os" else None,
         )
         all_sinks.insert(0, mqtt)  # so that no other sink delays the messages
     hooks = AlarmHooks(

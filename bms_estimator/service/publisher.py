@@ -12,15 +12,13 @@ from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealt
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info, Snapshot
 from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.latency import Latency
-from bms_estimator.service.service_status import ServiceStatus
+from bms_estimator.service.service_status import Latency, ServiceStatus
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import make_cells_payload
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.health import (
     dropped_text,
     make_health_payload,
@@ -28,11 +26,16 @@ from bms_estimator.telemetry.health import (
     pack_model_health,
     sample_counters,
 )
-from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals, new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.publish_window import Window, WindowSummary
-from bms_estimator.telemetry.rest_detector import RestDetector
-from bms_estimator.telemetry.state import make_forecast_payload, make_info_payload, make_state_payload, no_forecast
+from bms_estimator.telemetry.publish_window import RestDetector, Window, WindowSummary
+from bms_estimator.telemetry.state import (
+    finite,
+    make_forecast_payload,
+    make_info_payload,
+    make_state_payload,
+    no_forecast,
+)
 from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 
 log = structlog.get_logger(__name__)
@@ -88,6 +91,7 @@ class Publisher:
         self._latency = Latency()
         self._forecast_s = -math.inf  # time of the last payload of the curves
         self._no_forecast = no_forecast(cell.no_forecast_reason)
+        self._device_soc: float | None = None  # SOC that the device reported last
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
@@ -139,6 +143,7 @@ class Publisher:
         if trace.size:
             self._window.add(trace, self._clock.wall(), received.cells_v, received.probes)
             self._sample_s = now_s
+        self._device_soc = finite(received.device_soc[-1]) if received.device_soc.size else None
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
         elif self._drop_reason is not None:
@@ -260,6 +265,7 @@ class Publisher:
             self._flow,
             capacity_ah,
             estimate_fields(self._pack),
+            self._device_soc,
         )
 
     def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:

@@ -1,13 +1,56 @@
-"""State of the service around a pack, for the topic ``health``."""
+"""State of the service for the topic ``health``, and the latency of its blocks."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from bms_estimator.model.payloads.health import EdgeHealth, HookHealth, RecordingHealth
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.sources.source import SourceHealth
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.health import NO_FIT, FitTimes
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
+
+MIN_S = 1e-5
+"""Upper edge of the first bin [s]."""
+BINS_PER_OCTAVE = 4
+"""Number of bins per doubling of the latency, so that each bin is a fifth wider than the previous one."""
+BINS = 100
+"""Number of bins; the last one begins at five minutes."""
+
+
+class Latency:
+    """Histogram of latencies in logarithmic bins, so that adding a value is cheap."""
+
+    def __init__(self) -> None:
+        self._counts = [0] * BINS
+        self._max_s = 0.0
+
+    def add(self, latency_s: float) -> None:
+        """Add a latency [s]."""
+        octaves = math.log2(max(latency_s, MIN_S) / MIN_S)
+        self._counts[min(math.ceil(BINS_PER_OCTAVE * octaves), BINS - 1)] += 1
+        self._max_s = max(self._max_s, latency_s)
+
+    def take(self) -> tuple[float, float, float] | None:
+        """Return median, 99th percentile and maximum since the last call [s]; None without a value.
+
+        The percentiles are too long by up to a fifth.
+        """
+        counts, max_s = self._counts, self._max_s
+        self._counts, self._max_s = [0] * BINS, 0.0
+        if not any(counts):
+            return None
+        return _percentile(counts, 0.5, max_s), _percentile(counts, 0.99, max_s), max_s
+
+
+def _percentile(counts: list[int], fraction: float, max_s: float) -> float:
+    """Return the upper edge of the percentile's bin, or the maximum [s]."""
+    rank, cumulative = fraction * sum(counts), 0
+    for i, count in enumerate(counts):
+        cumulative += count
+        if cumulative >= rank:
+            return min(MIN_S * math.exp2(i / BINS_PER_OCTAVE), max_s)
+    return max_s
 
 
 @dataclass

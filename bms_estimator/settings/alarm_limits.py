@@ -226,7 +226,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         "under_temperature": _Default(-20.0, -15.0),
         "charging_below_freezing": _Default(0.0, 2.0),
         "soc_low": _Default(0.1, 0.15),
-        "collapse_risk": _collapse_default(settings, cell),
+        "collapse_risk": _collapse_default(settings),
         "stability_margin_low": _Default(0.05, 0.08),
         "cell_imbalance": _Default(0.05, 0.03),
         "weak_cell": _weak_cell_default(settings) if n > 1 else _UNMONITORED,
@@ -239,10 +239,10 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
     return all_packs | (_battery_defaults(cell) if isinstance(cell, CellModel) else _stack_defaults(cell))
 
 
-def _collapse_default(settings: Settings, cell: PackModel) -> _Default:
+def _collapse_default(settings: Settings) -> _Default:
     """Return the limit for the accepted rate of false alarms. Without a forecast the alarm is not monitored."""
-    if not isinstance(cell, CellModel) or not settings.identifier.enabled:
-        return _Default(None, None)
+    if not settings.identifier.enabled:
+        return _UNMONITORED
     limit = collapse_limit(settings.alarms.collapse_risk.false_alarms_per_month)
     return _Default(limit, COLLAPSE_CLEAR_FRACTION * limit)
 
@@ -292,5 +292,6 @@ def _stack_defaults(cell: PackModel) -> dict[AlarmName, _Default]:
         "charge_over_current": _UNMONITORED,
         "charging_below_freezing": _UNMONITORED,
         "weak_cell": _UNMONITORED,
+        "collapse_risk": _UNMONITORED,
         "over_temperature": _Default(90.0, 85.0),
     }

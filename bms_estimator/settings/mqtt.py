@@ -43,4 +43,8 @@ class MqttSettings(BrokerSettings):
     base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
         default="bms", description="prefix of all topics; must not contain +, # or spaces, nor begin or end with /"
     )
+    profile: Literal["venus-os"] | None = Field(
+        default=None,
+        description="also publish the battery for a Victron GX device on the topic venus below that of the pack, as dbus-mqtt-battery reads it",
+    )
     commands: tuple[Command, ...] = Field(default=(), description="commands that clients may send; default: none")

@@ -9,12 +9,11 @@ from bms_estimator.model.config_file import Fraction, Positive, Strict, read_tom
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.registry import max_batteries
 from bms_estimator.settings.alarms import AlarmSettings
-from bms_estimator.settings.charge_limits import ChargeLimits
 from bms_estimator.settings.exports import EdgeSettings, InfluxSettings, PrometheusSettings
 from bms_estimator.settings.mqtt import HomeAssistantSettings, MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.sampling import ChargeLimits, Sampling
 from bms_estimator.settings.sensor import ALLOWED_WITH_SOURCE, SensorSettings
 from bms_estimator.settings.sources.ble import BleSource
 from bms_estimator.settings.sources.can import CanSource
@@ -99,6 +98,10 @@ class PackSettings(PackValues, _PackNames):
     max_discharge_a: Positive | None = Field(
         default=None,
         description="largest discharge current of the pack by its rating or its BMS, which bounds the available power; default: 1 C, or the largest current that the pack has supplied for a second",
+    )
+    device_soc_std: Annotated[float, Field(gt=0, le=0.5)] | None = Field(
+        default=None,
+        description="standard deviation 0..0.5 of the SOC that the device reports, such as 0.1; a new pack starts with this SOC as a prior; default: the SOC of the device is not used",
     )
     max_charge_a: Positive | None = Field(
         default=None,

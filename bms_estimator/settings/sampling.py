@@ -1,6 +1,22 @@
-"""Sampling of a source: period, resolution, dead band and gain errors."""
+"""Sampling of a source: period, resolution, dead band and gain errors; and limits of charger and protection."""
 
 from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ChargeLimits:
+    """Limits of a pack; None: the default of the cell file."""
+
+    full_voltage_v: float | None = None
+    """Terminal voltage at which the charger ends a charge [V]."""
+    tail_current_a: float | None = None
+    """Charge current at which the charger ends a charge [A]."""
+    cutoff_voltage_v: float | None = None
+    """Terminal voltage at which the protection ends a discharge [V]."""
+
+
+NO_LIMITS = ChargeLimits()
+"""Defaults of the cell file."""
 
 
 @dataclass(frozen=True)

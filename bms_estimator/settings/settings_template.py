@@ -53,11 +53,20 @@ def _setting_lines(section: type[BaseModel], given: Mapping[str, object]) -> Ite
         key = field.alias or name
         yield from _comment("  ".join(part for part in (field.description, _unit_and_constraints(key, field)) if part))
         if key in given:
-            yield f"{key} = {tomlkit.item(given[key]).as_string()}"
+            yield f"{key} = {_toml(given[key])}"
         elif field.examples:  # instead of an empty default
             yield from (f"#{line}" for line in field.examples[0].splitlines())
         else:
             yield f"#{key} = {_default_as_toml(field)}"
+
+
+def _toml(value: object) -> str:
+    """Return a value as TOML in one line."""
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{key} = {_toml(each)}' for key, each in value.items())} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return tomlkit.item(value).as_string()
 
 
 def _default_as_toml(field: FieldInfo) -> str:

@@ -1,10 +1,14 @@
 """Answers about a new pack, and the settings that follow from them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from bms_estimator.model.decimal_text import number
+from bms_estimator.settings.page import DEFAULT_LISTEN
 from bms_estimator.settings.settings_template import GivenSettings
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import FoundDevice
+from bms_estimator.setup.measurement import Measurement
 
 
 class InvalidAnswerError(Exception):
@@ -29,8 +33,8 @@ class Answers:
     """Answers so far; None: not answered yet."""
 
     device: FoundDevice
-    voltage_v: float | None = None
-    """Measured voltage of the pack [V]; None: not measured."""
+    measured: Measurement | None = None
+    """Values of the device; None: no sample arrived."""
     name: str | None = None
     cell: str | None = None
     capacity_ah: float | None = None
@@ -41,26 +45,51 @@ class Answers:
     """Largest discharge current of the pack [A]; None: no limit is configured."""
     max_charge_a: float | None = None
     """Largest charge current of the pack [A]; None: no limit is configured."""
-    broker: str | None = None
-    """URL of the broker to which the service publishes; empty: no broker."""
-    found_broker: str | None = None
-    """URL of a broker that answered during the search; None: no broker answered."""
+    device_soc_std: float | None = None
+    """Std of the device's SOC, with which the pack starts; None: it is not used."""
+    broker: BrokerLogin | None = None
+    """Broker to which the service publishes; None: no broker."""
+    found_broker: BrokerLogin | None = None
+    """Broker that answered during the search; None: no broker answered."""
     sensor: tuple[tuple[str, object], ...] = ()
     """Settings of ``[sensor]`` from the comparison with a multimeter: key and value of each."""
 
     @property
+    def voltage_v(self) -> float | None:
+        """Measured voltage of the pack [V]; None: not measured."""
+        return self.measured.voltage_v if self.measured else None
+
+    @property
+    def logins(self) -> Mapping[str, BrokerLogin]:
+        """Brokers of the pack by section. The source uses the broker of ``[mqtt]`` unless it has its own."""
+        source = None if self.device.broker == self.broker else self.device.broker
+        return {section: login for section, login in (("mqtt", self.broker), ("source", source)) if login}
+
+    def password_file(self, section: str) -> str:
+        """Return the name of the file beside the settings with the password for the broker of a section."""
+        return f"{self.name}-{section}.password"
+
+    @property
     def tables(self) -> GivenSettings:
-        """Settings of the pack by section and key."""
+        """Settings of the pack by section and key. The password files are beside the settings."""
+        return self._tables({key: login.settings(self.password_file(key)) for key, login in self.logins.items()})
+
+    @property
+    def temporary_tables(self) -> GivenSettings:
+        """Settings of the pack with temporary password files."""
+        return self._tables({section: login.temporary_settings for section, login in self.logins.items()})
+
+    def _tables(self, brokers: GivenSettings) -> GivenSettings:
         pack = {key: getattr(self, key) for key in ("name", "cell", "capacity_ah", "series", "parallel")}
         limits = {"max_discharge_a": self.max_discharge_a, "max_charge_a": self.max_charge_a}
-        pack |= {key: limit_a for key, limit_a in limits.items() if limit_a is not None}
+        optional = limits | {"device_soc_std": self.device_soc_std}
+        pack |= {key: value for key, value in optional.items() if value is not None}
         tables: dict[str, dict[str, object]] = {"pack": pack}
         for section, values in self.device.tables.items():
             tables[section] = dict(values)
         if self.sensor:
             tables["sensor"] = {**tables.get("sensor", {}), **dict(self.sensor)}
-        if self.broker:
-            tables["mqtt"] = {"url": self.broker}
-        if self.device.broker and self.device.broker != self.broker:
-            tables["source"]["url"] = self.device.broker
+        tables["page"] = {"listen": DEFAULT_LISTEN}
+        for section, broker in brokers.items():
+            tables[section] = {**tables.get(section, {}), **broker}
         return tables

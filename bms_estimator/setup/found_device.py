@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.settings_template import GivenSettings
+from bms_estimator.setup.broker_login import BrokerLogin
 
 NAME_SEPARATOR = ":"
 """Separator between profile and address in ``FoundDevice.name``."""
@@ -22,15 +23,15 @@ class FoundDevice:
     """Number of cells in series, if the device reports it."""
     values: str = ""
     """Values that were received during the search, as text; empty if the search received none."""
-    broker: str | None = None
-    """URL of the broker to which an MQTT device publishes; None: another kind of device."""
+    broker: BrokerLogin | None = None
+    """Broker to which an MQTT device publishes; None: another kind of device."""
 
     @property
     def settings(self) -> Settings:
         """Settings of a pack with this device. All other settings have their defaults, with which nothing is published."""
         source = dict(self.tables.get("source", {}))
         if self.broker is not None:
-            source["url"] = self.broker
+            source |= self.broker.temporary_settings
         return Settings.model_validate({**self.tables, **({"source": source} if source else {})})
 
     def __str__(self) -> str:

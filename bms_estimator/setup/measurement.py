@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.setup.found_device import values_text
 from bms_estimator.sources.factory import open_line_source
 from bms_estimator.sources.serial.serial_source import SerialSource
-from bms_estimator.sources.source import Source
+from bms_estimator.sources.source import ReceivedSamples, Source
 
 FIRST_SAMPLE_S = 15.0
 """Timeout of the first sample [s]. A board needs up to 3 s after its port was opened, a Bluetooth BMS up to 15 s."""
@@ -28,10 +29,16 @@ class Measurement:
     voltage_v: float
     current_a: float
     """Current [A], positive on discharge."""
+    soc: float | None = None
+    """Last SOC that the device reports, 0..1; None: it reports none."""
+    capacity_ah: float | None = None
+    """Capacity from which the device computes its SOC [Ah]; None: not reported."""
 
     def __str__(self) -> str:
-        """Return voltage and current as text."""
-        return values_text(self.voltage_v, self.current_a)
+        """Return the values as text."""
+        soc = "" if self.soc is None else f"; the device reports an SOC of {self.soc:.0%}"
+        capacity = "" if self.capacity_ah is None else f" and a capacity of {self.capacity_ah:g} Ah"
+        return values_text(self.voltage_v, self.current_a) + soc + capacity
 
 
 def open_pack_source(settings: Settings) -> Source:
@@ -66,20 +73,27 @@ async def measure(settings: Settings, response_s: float | None = None) -> Measur
         ModuleNotFoundError: The optional package of the source is missing.
     """
     timeout_s = first_sample_timeout_s(settings, response_s)
-    blocks = []
+    blocks = list[ReceivedSamples]()
     async with open_pack_source(settings) as source:
         received = aiter(source)
         try:
             async with asyncio.timeout(timeout_s):
-                blocks.append((await anext(received)).samples.copy())
+                blocks.append(await anext(received))
         except TimeoutError:
             raise UserError(f"no sample within {timeout_s:g} s: {source.silence_reason}") from None
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(AVERAGE_S):
                 async for block in received:
-                    blocks.append(block.samples.copy())  # noqa: PERF401 - the timeout would lose a comprehension
-    samples = np.concatenate(blocks)
+                    blocks.append(block)
+    samples = np.concatenate([block.samples for block in blocks])
+    reported = [float(soc) for block in blocks for soc in block.device_soc if math.isfinite(soc)]
+    capacity_ah = blocks[-1].device_capacity_ah
     valid = samples[np.isfinite(samples["voltage_v"]) & np.isfinite(samples["current_a"])]
     if not valid.size:
         raise UserError("the device sends no valid voltage and current: is the pack connected to it?")
-    return Measurement(float(valid["voltage_v"].mean()), float(valid["current_a"].mean()))
+    return Measurement(
+        float(valid["voltage_v"].mean()),
+        float(valid["current_a"].mean()),
+        reported[-1] if reported else None,
+        capacity_ah if math.isfinite(capacity_ah) else None,
+    )

@@ -1,6 +1,7 @@
 """Recognition of battery publishers in MQTT messages by the topics of the known profiles. It does no I/O."""
 
 import functools
+import itertools
 import re
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -10,11 +11,18 @@ import numpy as np
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.settings.sources.mqtt import MqttSource, ValueLocation
 from bms_estimator.settings.sources.mqtt_profiles import DISCHARGE, PROFILES, ProfileName
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice, values_text
 from bms_estimator.sources.mqtt.payload_value import InvalidValueError, read_cells, read_value
 
 MAX_PUBLISHERS = 1000
 """Maximum number of publishers that are stored. Messages of further publishers are ignored."""
+MIN_LIVE_MESSAGES = 3
+"""Minimum number of messages with a voltage or a current that show how a publisher sends."""
+SAME_PACK = 0.02
+"""Maximum difference of the voltages of two devices of one pack, as a fraction."""
+MAX_SILENT_S = 300.0
+"""Setting ``source.max_silent_s`` of a publisher that sends only changes [s]."""
 _PLACEHOLDER = re.compile(r"\{(prefix|instance|cell|probe)\}")
 _PATTERNS = {"prefix": ".+", "instance": "[^/]*", "cell": "[0-9]{1,3}", "probe": "[0-9]{1,3}"}
 """Pattern of the text that replaces a placeholder of a topic."""
@@ -43,8 +51,9 @@ class PublisherRecognition:
     def __init__(self) -> None:
         self._values: dict[Publisher, dict[str, float]] = {}
         self._topics: dict[Publisher, str] = {}  # topic of the voltage
+        self._live: dict[Publisher, dict[str, list[bytes]]] = {}  # live payloads by name of the value
 
-    def add_message(self, topic: str, payload: bytes) -> None:
+    def add_message(self, topic: str, payload: bytes, *, retained: bool = False) -> None:
         """Store the values that the profiles with this topic read from the message."""
         recognized = set[tuple[ProfileName, str]]()
         for template in _templates():
@@ -61,15 +70,17 @@ class PublisherRecognition:
                 self._values.setdefault(publisher, {}).update(values)
                 if template.quantity == "voltage":
                     self._topics[publisher] = topic
+                for name in () if retained else values:
+                    self._live.setdefault(publisher, {}).setdefault(name, []).append(payload)
 
-    def devices(self, broker: str) -> list[FoundDevice]:
+    def devices(self, broker: BrokerLogin) -> list[FoundDevice]:
         """Return the publishers of voltage and current, those with the most values first.
 
         A topic may be part of several profiles. For each voltage topic the publisher with the most values is returned;
         publishers with equally many values are all returned.
 
         Args:
-            broker: URL of the broker that sent the messages.
+            broker: Broker that sent the messages.
         """
         complete = {p: values for p, values in self._values.items() if {"voltage", "current"} <= values.keys()}
         value_counts = dict[str, int]()  # number of values of the best publisher, by voltage topic
@@ -77,7 +88,21 @@ class PublisherRecognition:
             topic = self._topics[publisher]
             value_counts[topic] = max(value_counts.get(topic, 0), len(values))
         best = [p for p, values in complete.items() if len(values) == value_counts[self._topics[p]]]
-        return [_device(p, complete[p], broker) for p in sorted(best, key=lambda p: (-len(complete[p]), p))]
+        best.sort(key=lambda p: (-len(complete[p]), p))
+        found = [_device(p, complete[p], broker, only_changes=self._sends_only_changes(p)) for p in best]
+        pairs = itertools.product(zip(best, found, strict=True), repeat=2)
+        return found + [
+            _combined(monitor, bms)
+            for (p, monitor), (q, bms) in pairs
+            if bms.cells and not monitor.cells and _are_of_one_pack(complete[p]["voltage"], complete[q]["voltage"])
+        ]
+
+    def _sends_only_changes(self, publisher: Publisher) -> bool:
+        """Return True if most values arrived only as retained messages, others several times, and none was repeated."""
+        live = self._live.get(publisher, {})
+        repeated = any(a == b for payloads in live.values() for a, b in itertools.pairwise(payloads))
+        often = max((len(live.get(name, ())) for name in ("voltage", "current")), default=0) >= MIN_LIVE_MESSAGES
+        return often and not repeated and len(live) < 0.5 * len(self._values[publisher])
 
 
 @functools.cache
@@ -129,19 +154,50 @@ def _values(template: _Template, publisher: Publisher, topic: str, payload: byte
         return {}
 
 
-def _device(publisher: Publisher, values: Mapping[str, float], broker: str) -> FoundDevice:
+def _are_of_one_pack(voltage_v: float, other_v: float) -> bool:
+    """Return True if two voltages may be of one pack [V]."""
+    return abs(voltage_v - other_v) <= SAME_PACK * max(voltage_v, other_v)
+
+
+def _combined(monitor: FoundDevice, bms: FoundDevice) -> FoundDevice:
+    """Return a device with current and voltage of a battery monitor, such as a shunt, and cells and temperatures of a BMS."""
+    source = MqttSource.model_validate(bms.tables["source"])
+    locations = dict[str, list[dict[str, object]]]()
+    for name, location in source.locations():
+        if name in ("cells", "temperature"):
+            values = location.model_dump(exclude_defaults=True)
+            topics = [source.substitute(topic) for topic in location.topics]
+            locations.setdefault(name, []).append({**values, "topic": topics})
+    cells = {"cells": locations["cells"][0], "temperature": locations.get("temperature", [])}
+    return FoundDevice(
+        name=f"{monitor.name}+{bms.name}",
+        description=f"{monitor.description}, with cells and temperatures of {bms.name}",
+        tables={"source": {**monitor.tables["source"], **cells}},
+        cells=bms.cells,
+        values=monitor.values,
+        broker=monitor.broker,
+    )
+
+
+def _device(
+    publisher: Publisher, values: Mapping[str, float], broker: BrokerLogin, *, only_changes: bool
+) -> FoundDevice:
     profile = PROFILES[publisher.profile]
-    source = {"kind": "mqtt", "profile": publisher.profile}
+    source: dict[str, object] = {"kind": "mqtt", "profile": publisher.profile}
     for key in ("prefix", "instance"):
         value = getattr(publisher, key)
         if value and value != profile.table.get(key):
             source[key] = value
+    if only_changes:
+        source["max_silent_s"] = MAX_SILENT_S
     sign = 1.0 if profile.current_sign == DISCHARGE else -1.0
-    name = NAME_SEPARATOR.join(filter(None, (publisher.profile, source.get("prefix"), source.get("instance"))))
+    name = NAME_SEPARATOR.join(
+        str(part) for part in (publisher.profile, source.get("prefix"), source.get("instance")) if part
+    )
     cells = int(is_live(np.array([v for key, v in values.items() if key.startswith("cell ")])).sum())
     return FoundDevice(
         name=name,
-        description=f"{MqttSource.model_validate(source).short_description}, {broker}",
+        description=f"{MqttSource.model_validate(source).short_description}, {broker.url}",
         tables={"source": source},
         cells=cells or None,
         values=values_text(values["voltage"], sign * values["current"]),

@@ -30,17 +30,21 @@ class NewPack:
 
 
 def create_pack(file: Path, answers: Answers) -> NewPack:
-    """Check the settings of a pack, and write its settings file. Invalid settings are not written.
+    """Check the settings of a pack, and write its settings file, and files with the passwords for brokers beside it.
+
+    Invalid settings are not written.
 
     Raises:
         UserError: A setting is invalid, or the file exists or cannot be written.
         ModuleNotFoundError: The optional package of the source is missing.
     """
-    settings = parse_toml(settings_file(Settings, answers.tables), Settings, str(file))
+    settings = parse_toml(settings_file(Settings, answers.temporary_tables), Settings, str(file))
     pack = settings.pack
     cell = load_cell(pack.cell, pack.capacity_ah).pack(pack.series, pack.parallel)
     warnings = check_settings(settings, cell)
     create_pack_file(file, answers.tables)
+    for section, login in answers.logins.items():
+        login.write_password(file.with_name(answers.password_file(section)))
     return NewPack(settings, cell, warnings)
 
 

@@ -10,10 +10,9 @@ from pydantic import BaseModel, ValidationError
 from bms_estimator.estimator.settings_plausibility import MAX_CAPACITY_AH
 from bms_estimator.model.cell import generic_cells, shipped_cells
 from bms_estimator.model.config_file import error_reason, without_secrets
-from bms_estimator.mqtt.broker_config import parse_url
-from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DEVICE_NAME, PackSettings
 from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
+from bms_estimator.setup.broker_login import FORM, BrokerLogin
 from bms_estimator.setup.series_count import cell_voltages, possible_counts, suggest_count
 
 CHEMISTRIES: Mapping[str, str] = {
@@ -34,7 +33,9 @@ SYNONYMS = {
 NO_BROKER = "none"
 """Answer for a service that publishes nothing over MQTT."""
 NO_LIMIT = "none"
-"""Answer for a current without a configured limit."""
+"""Answer for a current without a configured limit, and for a device whose SOC is not used."""
+DEVICE_SOC_STD = "10"
+"""Default standard deviation of the SOC by a device [%]. Counters of coulombs drift by about as much between two full charges."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,8 @@ class Question:
     """Function that returns the default answer; empty without one."""
     choices: tuple[tuple[str, str], ...] = ()
     """Common answers with their descriptions."""
+    is_asked: Callable[[Answers], bool] = lambda _: True
+    """Function that returns False if the question does not concern this device."""
 
     @property
     def option(self) -> str:
@@ -131,15 +134,34 @@ def _parse_max_charge(text: str, _: Answers) -> object:
     return None if text == NO_LIMIT else _validated(PackSettings, "max_charge_a", parse_number(text, "A"))
 
 
-def _parse_broker(text: str, _: Answers) -> object:
+def _parse_device_soc_std(text: str, _: Answers) -> object:
+    return None if text == NO_LIMIT else _validated(PackSettings, "device_soc_std", parse_number(text, "%") / 100.0)
+
+
+def _reports_soc(answers: Answers) -> bool:
+    return answers.measured is not None and answers.measured.soc is not None
+
+
+def _suggest_capacity(answers: Answers) -> str:
+    """Return the capacity of the pack by the device, which is that of a cell unless cells are in parallel."""
+    capacity_ah = answers.measured.capacity_ah if answers.measured else None
+    return "" if capacity_ah is None else f"{capacity_ah:g}"
+
+
+def _parse_broker(text: str, answers: Answers) -> object:
     if text == NO_BROKER:
-        return ""
-    url = _validated(MqttSettings, "url", text)
+        return None
     try:
-        parse_url(text)
+        login = BrokerLogin.parse(text)
     except ValueError as error:
         raise InvalidAnswerError(f"{without_secrets(text)}: {error}") from None
-    return url
+    found = answers.device.broker or answers.found_broker
+    return found if found and login == BrokerLogin(found.url) else login
+
+
+def _suggest_broker(answers: Answers) -> str:
+    found = answers.device.broker or answers.found_broker
+    return found.url if found else NO_BROKER
 
 
 def _suggest_series(answers: Answers) -> str:
@@ -174,7 +196,11 @@ QUESTIONS = (
         tuple(CHEMISTRIES.items()),
     ),
     Question(
-        "capacity_ah", "Capacity of one cell [Ah]", "rated capacity of one cell [Ah]", _parse_capacity, lambda _: ""
+        "capacity_ah",
+        "Capacity of one cell [Ah]",
+        "rated capacity of one cell [Ah]",
+        _parse_capacity,
+        _suggest_capacity,
     ),
     Question("series", "Cells in series", "number of cells in series", _parse_series, _suggest_series),
     Question("parallel", "Cells in parallel", "number of cells in parallel", _parse_parallel, lambda _: "1"),
@@ -193,11 +219,19 @@ QUESTIONS = (
         lambda _: NO_LIMIT,
     ),
     Question(
+        "device_soc_std",
+        "Standard deviation of the device's SOC, with which the estimate starts [%]",
+        f"standard deviation of the SOC by the device, with which the estimate starts [%]; {NO_LIMIT}: it is not used",
+        _parse_device_soc_std,
+        lambda answers: DEVICE_SOC_STD if _reports_soc(answers) else NO_LIMIT,
+        is_asked=_reports_soc,
+    ),
+    Question(
         "broker",
         "MQTT broker to publish to",
-        f"URL of the MQTT broker to which the service publishes, mqtt://host:port; {NO_BROKER}: no broker",
+        f"URL of the MQTT broker to which the service publishes, {FORM}; {NO_BROKER}: no broker",
         _parse_broker,
-        lambda answers: answers.device.broker or answers.found_broker or NO_BROKER,
+        _suggest_broker,
     ),
 )
 """Questions in their order."""

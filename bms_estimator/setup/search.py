@@ -7,16 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
-from pydantic import ValidationError
-
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
+from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, LoginError
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.settings.sources.modbus import PROFILES as MODBUS_PROFILES
+from bms_estimator.setup.broker_login import FORM, BrokerLogin
 from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice
 from bms_estimator.setup.measurement import measure
 from bms_estimator.setup.mqtt_recognition import PublisherRecognition
@@ -42,8 +41,10 @@ class SearchResult:
     devices: list[FoundDevice] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     """Places without a device, each with the reason."""
-    broker: str | None = None
-    """URL of the broker that answered; None: no broker."""
+    broker: BrokerLogin | None = None
+    """Broker that answered; None: no broker."""
+    closed: list[BrokerLogin] = field(default_factory=list)
+    """Brokers that require another user name or password."""
 
 
 def default_places() -> list[str]:
@@ -55,7 +56,7 @@ async def search(places: Sequence[str]) -> SearchResult:
     """Search all places at the same time.
 
     Args:
-        places: Paths of serial ports, URLs of MQTT brokers, ``BLUETOOTH``, and Modbus devices as ``host`` or ``host:port``.
+        places: Paths of serial ports, addresses of MQTT brokers with or without user name and password, ``BLUETOOTH``, and Modbus devices as ``host`` or ``host:port``.
 
     Returns:
         The devices. A place that cannot be searched is one of the failures, whatever exception its search raised.
@@ -106,16 +107,17 @@ def serial_device(port: str, found: DetectedDevice) -> FoundDevice:
     return FoundDevice(port, str(found), {"sensor": sensor}, found.cells)
 
 
-async def _search_mqtt(url: str, result: SearchResult) -> None:
+async def _search_mqtt(address: str, result: SearchResult) -> None:
     """Listen to all messages of a broker, and find the publishers of known profiles.
 
     Raises:
         UserError: The URL cannot be used.
     """
     try:
-        settings = MqttSettings(url=url)
-    except ValidationError:
-        raise UserError(f"{without_secrets(url)}: must be mqtt://host:port, or mqtts://host:port for TLS") from None
+        login = BrokerLogin.parse(address)
+    except ValueError as error:
+        raise UserError(f"{without_secrets(address)}: {error}") from None
+    url, settings = login.url, MqttSettings.model_validate(login.temporary_settings)
     check(settings)
     recognition = PublisherRecognition()
     options = ConnectOptions(
@@ -123,7 +125,7 @@ async def _search_mqtt(url: str, result: SearchResult) -> None:
     )
     try:
         async with BrokerConnector(settings)(brokers(settings)[0], options) as connection:
-            result.broker = url
+            result.broker = login
             denied = await connection.subscribe(None, ["#"])
             if denied:
                 result.failures.append(f"{url}: not allowed to read #: {denied['#']}")
@@ -132,13 +134,18 @@ async def _search_mqtt(url: str, result: SearchResult) -> None:
                 async with asyncio.timeout(LISTEN_S):
                     while True:
                         message = await connection.receive()
-                        recognition.add_message(message.topic, message.payload)
+                        recognition.add_message(message.topic, message.payload, retained=message.retain)
             except TimeoutError:
                 pass
+    except LoginError:
+        reason = "requires a user name and a password" if login.username is None else "user name or password wrong"
+        result.failures.append(f"{url}: {reason}; give them as {FORM}")
+        result.closed.append(login)
+        return
     except BrokerConnectionError as error:
         result.failures.append(f"{url}: {error}")
         return
-    found = recognition.devices(url)
+    found = recognition.devices(login)
     result.devices += found
     if not found:
         result.failures.append(f"{url}: no message of a known publisher within {LISTEN_S:g} s")

@@ -31,6 +31,8 @@ class SimulatedNode:
         prefix: Name of the node, the first level of its topics.
         speed: Speed relative to real time.
         seed: Seed of the differences between the cells.
+        soc: Function that returns the SOC 0..1 that the BMS shows; None: it shows none.
+        capacity_ah: Capacity that is configured in the BMS [Ah].
 
     Raises:
         UserError: The broker's URL cannot be used.
@@ -45,8 +47,11 @@ class SimulatedNode:
         prefix: str = "jk-bms",
         speed: float = 1.0,
         seed: int = 0,
+        soc: Callable[[], float] | None = None,
+        capacity_ah: float = 100.0,
     ) -> None:
         self._signal, self._prefix, self._speed = signal, prefix, speed
+        self._soc, self._capacity_ah = soc, capacity_ah
         self._deviations_v = _cell_deviations(cells, random.Random(seed))
         self.path = f"{prefix}/sensor/+/state on {', '.join(mqtt.urls)}"
         self.time_s = 0.0
@@ -102,6 +107,9 @@ class SimulatedNode:
         yield "total_voltage", f"{voltage_v:.2f}"
         yield "current", f"{-current_a:.2f}"
         yield "power", f"{-current_a * voltage_v:.2f}"
+        if self._soc is not None:
+            yield "state_of_charge", f"{100.0 * self._soc():.0f}"
+            yield "total_battery_capacity_setting", f"{self._capacity_ah:.0f}"
         yield "temperature_sensor_1", f"{temperature_c:.1f}"
 
 

@@ -173,7 +173,10 @@ class LineSource:
                 self._block_arrival_s = chunk[0]
                 self._silence_reason, self._retry_s = None, self._first_retry_s
                 self._silence_log.on_samples(self._last_sample_s)
-                yield ReceivedSamples(block, self._decoder.cells, self._decoder.probes)
+                decoder = self._decoder
+                yield ReceivedSamples(
+                    block, decoder.cells, decoder.probes, decoder.device_soc, decoder.device_capacity_ah
+                )
         if self._produce_task is not None and not self._produce_task.cancelled():
             self._produce_task.result()
 

@@ -1,9 +1,11 @@
 """Interface of sources of samples: serial ports, captures, tables."""
 
+import math
 from collections.abc import AsyncIterator, Mapping
 from typing import NamedTuple, Protocol, Self
 
-from bms_estimator.model.sample import NO_PROBES, CellBlock, ProbeBlock, SampleBlock
+from bms_estimator.model.arrays import Floats
+from bms_estimator.model.sample import NO_PROBES, NO_SOC, CellBlock, ProbeBlock, SampleBlock
 
 Chunk = tuple[float, bytes]
 """Arrival time [s since 1970] and bytes of one read."""
@@ -40,6 +42,10 @@ class ReceivedSamples(NamedTuple):
     """Cell voltages of the samples, shape (n, m) [V]; ``NO_CELLS`` if none are measured."""
     probes: ProbeBlock = NO_PROBES
     """Temperature probes of the samples, shape (n, m); ``NO_PROBES`` without a list of them."""
+    device_soc: Floats = NO_SOC
+    """SOC that the device reports with each sample, 0..1, NaN without one, shape (n,); ``NO_SOC`` if it reports none."""
+    device_capacity_ah: float = math.nan
+    """Capacity from which the device computes its SOC [Ah]; NaN: not reported."""
 
 
 class Source(Protocol):

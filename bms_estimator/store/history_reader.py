@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.store.history import MINUTE_S, Minute
 from bms_estimator.store.migrations import MIGRATIONS
-from bms_estimator.store.minute import MINUTE_S, Minute
 
 _QUANTITIES = ("voltage", "v"), ("current", "a"), ("temperature", "c")
 _SUMS = "sum(charge_out_ah), sum(charge_in_ah), sum(energy_out_wh), sum(energy_in_wh), sum(seen_s), sum(publications)"

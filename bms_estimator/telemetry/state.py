@@ -1,4 +1,4 @@
-"""Payloads of the topics ``state``, ``info`` and ``forecast``."""
+"""Payloads of the topics ``state``, ``info`` and ``forecast``, and the text of a cut-off."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.forecast.forecast import FORECAST, Forecast, unknown_values
-from bms_estimator.kernels.accumulators.soc_certainty import MIN_UNKNOWN_STD
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -20,12 +19,48 @@ from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info
 from bms_estimator.model.sample import ProbeBlock
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
 from bms_estimator.telemetry.publish_window import WindowSummary
 from bms_estimator.version import __version__
 
-UNKNOWN_SOC = f"the SOC is not known yet: it is known once its standard deviation has fallen below {100.0 * MIN_UNKNOWN_STD:.0f} %"
-"""Reason without a known SOC."""
+MIN_SHOWN_MEDIAN_S = 600.0
+"""Minimum median time to the cut-off that is shown [s]. Below it only the band and the probability are shown, because a single
+load peak may decide."""
+
+
+CUTOFF_FIELDS = ("time_to_cutoff_s", "time_to_cutoff_p05_s", "time_to_cutoff_p95_s", "cutoff_within_5min")
+"""Published fields that are the arguments of ``cutoff_text``."""
+
+
+def cutoff_text(
+    median_s: float | None, p05_s: float | None, p95_s: float | None, within_5min: float | None
+) -> str | None:
+    """Return the time to the cut-off with its 90 % band; None if it is unknown.
+
+    For example ``1:52 h (1:20 to 2:31)``, or below ``MIN_SHOWN_MEDIAN_S`` ``3 to 9 min, 40 % within 5 min``.
+
+    Args:
+        median_s: Median of the time to the cut-off [s].
+        p05_s: 5 % quantile of this time [s].
+        p95_s: 95 % quantile of this time [s].
+        within_5min: Probability of the cut-off within 5 min, 0..1.
+    """
+    if median_s is None or p05_s is None or p95_s is None:
+        return None
+    if median_s >= MIN_SHOWN_MEDIAN_S:
+        return f"{clock_duration(median_s)} h ({clock_duration(p05_s)} to {clock_duration(p95_s)})"
+    band = f"{p05_s / 60.0:.0f} to {p95_s / 60.0:.0f} min"
+    return band if within_5min is None else f"{band}, {100.0 * within_5min:.0f} % within 5 min"
+
+
+def clock_duration(duration_s: float) -> str:
+    """Return hours and minutes, ``1:52``."""
+    hours, minutes = divmod(math.floor(duration_s / 60.0 + 0.5), 60)
+    return f"{hours}:{minutes:02d}"
+
+
+UNKNOWN_SOC = "the SOC is not known yet: charge the pack to full once, or let it rest for ten minutes"
+"""Reason without a known SOC, and what helps."""
 ALWAYS_STABLE = "the thesis's model is valid at each SOC: delta_1 and delta_2 are not above 0"
 """Reason with capacitances that are positive at each SOC."""
 NOT_IDENTIFIED = "delta_1 and delta_2 follow from a7..a12, which are not valid: see the topic parameters"
@@ -143,6 +178,7 @@ def make_state_payload(
     flow: ChargeEnergy,
     capacity_ah: float | None,
     cell_fields: Mapping[str, Any] = MappingProxyType({}),
+    device_soc: float | None = None,
 ) -> Estimate:
     """Return the payload of topic ``state``.
 
@@ -155,11 +191,13 @@ def make_state_payload(
         flow: Charge and energy at the terminals.
         capacity_ah: Rated capacity of the pack [Ah]; None for a fuel cell.
         cell_fields: Fields about single cells (``weakest_cell_fields``).
+        device_soc: SOC that the device reports, 0..1; None: not reported.
     """
     # a tuple of plain numbers, because reading the fields of a numpy record one by one is slow
     values = zip(TRACE.names or (), window.last.item(), strict=True)
     last = {name: value if math.isfinite(value) else None for name, value in values}
     innovation_v, soc, margin = last["innovation_v"], last["soc"], finite(known_margin(window.last, window.soc_known))
+    is_known = soc is not None and window.soc_known
     return Estimate(
         time=iso_utc(window.arrival_s),
         publish_time=iso_utc(now_s),
@@ -173,7 +211,9 @@ def make_state_payload(
         **{name: last[name] for name in COPIED},
         voltage_estimate_v=None if innovation_v is None else window.voltage_v - innovation_v,
         soc_percent=None if soc is None else 100.0 * soc,
-        soc_known=soc is not None and window.soc_known,
+        soc_known=is_known,
+        device_soc=device_soc,
+        device_soc_difference=soc - device_soc if soc is not None and is_known and device_soc is not None else None,
         stability_margin=margin,
         stability_margin_std=None if margin is None else last["stability_margin_std"],
         stability_margin_reason=missing_margin_reason(window.last, soc_known=window.soc_known),

@@ -2,6 +2,7 @@
 
 The package has a virtual environment in /usr/lib/bms-estimator with the wheel of this checkout and the packages that it
 requires. They are copied from the environment of this script, which is installed from requirements.lock with its hashes.
+It contains the compiled kernels, for the minor version of Python and the architecture of the machine that builds it.
 The maintainer scripts run ``bms-estimator install`` and ``uninstall``.
 """
 
@@ -18,12 +19,15 @@ from pathlib import Path
 from bms_estimator.installation import places
 from bms_estimator.installation.program_copy import (
     DISTRIBUTION,
+    PACKAGE,
     PYTHON,
     copy_packages,
     create_environment,
     required_packages,
     system_python,
 )
+from bms_estimator.numba_cache import CACHE_FOLDER
+from bms_estimator.service.kernel_compilation import COMPLETE_FILE, compile_kernels
 
 PROJECT = Path(__file__).parents[2]
 EXTRAS = ("calibration", "can", "modbus", "prometheus", "report")
@@ -52,6 +56,7 @@ def build(output: Path, compression: str) -> Path:
     packages = required_packages(program, EXTRAS)
     require_locked(packages)
     copy_packages(packages, site_packages)
+    copy_kernels(site_packages)
     for folder in list(site_packages.rglob("__pycache__")):  # postinst compiles the files on the machine
         shutil.rmtree(folder)
     link = root / "usr/bin/bms-estimator"
@@ -65,6 +70,18 @@ def build(output: Path, compression: str) -> Path:
     package = output / f"bms-estimator_{program.version}_{architecture()}.deb"
     subprocess.run(["dpkg-deb", "--root-owner-group", f"-Z{compression}", "--build", root, package], check=True)
     return package
+
+
+def copy_kernels(site_packages: Path) -> None:
+    """Copy the compiled kernels to the package, so that no machine compiles them. Compile those that are missing."""
+    compile_kernels()
+    if CACHE_FOLDER is None:
+        sys.exit("no folder for compiled kernels can be written: set NUMBA_CACHE_DIR=FOLDER")
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    for file in (CACHE_FOLDER / COMPLETE_FILE, *CACHE_FOLDER.rglob(f"*.{version}.*.nbc")):
+        target = site_packages / PACKAGE.name / "compiled" / file.relative_to(CACHE_FOLDER.parent)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, target)
 
 
 def build_wheel(output: Path) -> Path:

@@ -72,7 +72,7 @@ def test_missing_folder_is_an_error_before_the_computation(capture, tmp_path, ca
 
 def test_full_disk_leaves_the_old_file(capture, full_disk, capsys, monkeypatch):
     out = full_disk / "mine.toml"
-    monkeypatch.setattr("bms_estimator.model.cell_file.cell_text", lambda *_: "x" * 8192)
+    monkeypatch.setattr("bms_estimator.model.pack_model.cell_text", lambda *_: "x" * 8192)
     out.touch()
     (full_disk / "file").unlink()
     out.write_text("# measured in May\n")

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.conversion.c_header import c_header
-from bms_estimator.conversion.circuit import ladder_table
+from bms_estimator.conversion.circuit import c_header, ladder_table
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
 from tests.conversion.load import INITIAL_SOC, difference_mv, load_profile

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.installation.system_files import FILES
+from bms_estimator.installation.install import FILES
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 

@@ -76,7 +76,7 @@ systemctl is-enabled bms-estimator
 systemctl show bms-estimator -p WatchdogUSec
 grep -E "^(Uid|NoNewPrivs|Seccomp|CapEff):" "/proc/$(main_pid)/status"
 tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep BMS_BOOT_ID
-find $cache -name "step.run-*.nbi" -printf "cached %f\n"
+find $cache -name "step.run-*.nbc" -printf "cached %f\n"
 # in the mount namespace of the service
 nsenter -t "$(main_pid)" -m sh -c 'ls -A /home /root; touch /root/x /etc/x' 2>&1
 
@@ -89,8 +89,7 @@ ps -eo args | grep -v grep | grep -c "$secret"
 timeout 5 mosquitto_sub -C 2 -u dashboard -P two -t bms/pack/health -t bms/pack/info | grep -c "$secret"
 
 part watchdog
-for name in $(find $cache -name "*.nbi" | sort | tail -n 1); do : >"$name"; done # as a power cut leaves them
-for name in $(find $cache -name "*.nbc" | sort | head -n 1); do : >"$name"; done
+for name in $(find $cache -name "*.nbc" | sort | head -n 1); do : >"$name"; done # as a power cut leaves it
 # by this file systemd-timesyncd reports a synchronized clock, which the restarted service must see
 mkdir -p /run/systemd/timesync && touch /run/systemd/timesync/synchronized
 # a stopped process does not notify the watchdog

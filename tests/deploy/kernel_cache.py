@@ -3,8 +3,7 @@
 import shutil
 from pathlib import Path
 
-import numba
-
+from bms_estimator.numba_cache import CACHE_FOLDER
 from bms_estimator.service.kernel_warm_up import load_kernels
 
 OMITTED = "step.run-"
@@ -14,6 +13,5 @@ OMITTED = "step.run-"
 def fill(cache: Path, omitted: str | None = OMITTED) -> None:
     """Copy the tests' compiled kernels, except those whose files begin with ``omitted``, to ``cache``."""
     load_kernels()
-    compiled = Path(numba.config.CACHE_DIR)
     left_out = ["lock", "*.tmp.*", *([f"{omitted}*"] if omitted else [])]
-    shutil.copytree(compiled, cache / compiled.name, ignore=shutil.ignore_patterns(*left_out))
+    shutil.copytree(CACHE_FOLDER, cache / CACHE_FOLDER.name, ignore=shutil.ignore_patterns(*left_out))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.installation.system_files import FILES
+from bms_estimator.installation.install import FILES
 
 # Mounts an empty /run/udev, copies the rules ($1) there, and lets udevadm ($2) test a device ($3). It runs in a mount
 # namespace of its own, which ends with the shell.

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.installation import places
+from bms_estimator.installation.install import system_files
 from bms_estimator.installation.machine import Machine
-from bms_estimator.installation.system_files import system_files
 
 MAX_EXPOSURE = 1.5
 """Maximum exposure by `systemd-analyze security`, of 0 to 10."""

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.doctor import kernel_check
-from bms_estimator.doctor.disk_check import check_disk
+from bms_estimator.doctor.examine import check_disk
 from bms_estimator.doctor.finding import Level
 from bms_estimator.doctor.kernel_check import check_kernels
 from bms_estimator.numba_cache import source_digest
+from bms_estimator.service.kernel_compilation import COMPLETE_FILE
 from tests.doctor.as_user import as_nobody
 from tests.doctor.packs import subject, unit_with
 
@@ -58,10 +59,13 @@ def test_a_full_disk_is_a_fault_and_a_small_one_a_warning(full_disk: Path) -> No
     assert enough.level is Level.OK
 
 
-def test_kernels_are_cold_until_the_step_is_compiled(cache: Path) -> None:
+def test_kernels_are_cold_until_all_are_compiled(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (cold,) = check_kernels(None)
     assert (cold.level, "not compiled yet" in cold.text) == (Level.WARNING, True)
-    write(cache / source_digest() / "kernels" / "step.step-1.py311.nbi", 3_000_000)
+    monkeypatch.setattr(kernel_check, "available_bytes", lambda: 200 << 20)
+    _, memory = check_kernels(None)
+    assert (memory.level, "compiling needs 256 MiB of memory, and 200 MiB" in memory.text) == (Level.WARNING, True)
+    write(cache / source_digest() / COMPLETE_FILE, 3_000_000)
     (warm,) = check_kernels(None)
     assert (warm.level, warm.text) == (Level.OK, f"{cache / source_digest()}: compiled, 3 MB")
 
@@ -86,7 +90,7 @@ def test_without_a_writable_cache_folder_there_is_a_warning(cache: Path, monkeyp
 
 def test_the_cache_of_the_service_is_examined_if_there_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bms_estimator.doctor.subject.CACHE_ROOT", tmp_path)
-    write(tmp_path / "bms-estimator" / source_digest() / "kernels" / "step.step-1.py311.nbi", 1)
+    write(tmp_path / "bms-estimator" / source_digest() / COMPLETE_FILE, 1)
     (warm,) = check_kernels(subject(tmp_path, unit=unit_with()))
     assert warm.level is Level.OK
     assert kernel_check.size_of(tmp_path) == 1

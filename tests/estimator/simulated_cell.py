@@ -2,8 +2,11 @@
 
 import numpy as np
 
+from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.kernels.cell_model.open_loop import branch_currents
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
@@ -58,3 +61,21 @@ def measured(
     noisy_v = block["voltage_v"] + rng.normal(0, NOISE_V, block.size)
     block["voltage_v"] = np.round(noisy_v / RESOLUTION_V) * RESOLUTION_V
     return block, true_soc
+
+
+def simulate_file(cell: CellModel, current_a: np.ndarray, soc: float) -> tuple[SampleBlock, np.ndarray]:
+    """Return samples at 1 Hz of the cell of a file with an RC ladder, from rest at ``soc`` and 25 C, and its true SOC.
+
+    The voltage has a resolution of 1 mV.
+    """
+    p = Estimator(cell).cell_file_settings
+    samples = np.zeros(current_a.size, dtype=SAMPLE)
+    samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
+    true_soc = soc - np.cumsum(current_a) / p["capacity_as"]
+    ohm = p["weak_ohm"] + p["strong_ohm"]
+    grid = np.linspace(0.0, 1.0, ohm.shape[0])
+    currents_a = np.column_stack([current_a, branch_currents(samples["time_s"], current_a)])
+    voltage_drop_v = sum(np.interp(true_soc, grid, ohm[:, k]) * currents_a[:, k] for k in range(1 + BRANCHES))
+    ocv_v = np.array([chen_mora.ocv(x, p["ocv_v"], p["ocv_slope_v"]) for x in true_soc])
+    samples["voltage_v"] = np.round(ocv_v - voltage_drop_v, 3)
+    return samples, true_soc

@@ -9,13 +9,14 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.hypotheses import spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.records import LN_Q, NODE, Noise
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SampleBlock
+from bms_estimator.settings.sampling import Sampling
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, Capture, Case, capture
 from tests.estimator.anywhere.cycles import Cycle, true_curve
 from tests.estimator.anywhere.use import DAY_S, days
-from tests.estimator.simulated_cell import TRUTH, measured
+from tests.estimator.simulated_cell import TRUTH, measured, simulate_file
 
 CASES = {
     "oxide": Case("", file_temperatures_c="generic", load_before_h=0.0, seed=41),
@@ -163,3 +164,22 @@ def test_days_of_use_do_not_make_the_soc_overconfident() -> None:
     inside = np.abs(trace["soc"] - use.soc) < 2.0 * trace["soc_std"]
     assert inside[DAY_S : 2 * DAY_S].mean() > 0.95
     assert inside[2 * DAY_S :].mean() > 0.95
+
+
+def test_an_empty_cell_rests_in_a_gap() -> None:
+    """Near empty the voltage of the pack is a std of the generic curve above it, as that of another SOC. No load was possible in the gap."""
+    generic = load_cell("lco", 2.0)
+    assert isinstance(generic.ocv, TableOcv)
+    above_v = np.interp(generic.ocv.soc, (0.0, 0.03, 0.15), (0.1, 0.1, 0.0))
+    true_v = tuple((np.array(generic.ocv.ocv_v) + above_v).tolist())
+    truth = generic.model_copy(update={"ocv": generic.ocv.model_copy(update={"ocv_v": true_v})})
+    current_a = np.r_[np.zeros(600), np.full(1720, 4.0), np.zeros(2200), np.full(1200, -1.5)]
+    samples, true_soc = simulate_file(truth, current_a, 0.98)
+    after = 600 + 1720 + 2180
+    kept = np.r_[: 600 + 1720 + 20, after : samples.size]
+    estimator = Estimator(generic, initial_soc=0.98, sampling=Sampling(2.0))
+    trace = estimator.run(samples[kept][::2])
+    in_charge = trace["time_s"] >= after
+    error = (trace["soc"] - np.interp(trace["time_s"], samples["time_s"], true_soc))[in_charge]
+    assert np.sqrt(np.mean(error**2)) < 0.08
+    assert (np.abs(error) < 2.0 * trace["soc_std"][in_charge]).mean() > 0.9

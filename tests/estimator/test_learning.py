@@ -9,7 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.state import make_state_payload, no_forecast

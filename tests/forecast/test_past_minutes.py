@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.forecast.load_history import LoadHistory
-from bms_estimator.forecast.past_minutes import MINUTE_S, PEAK_S, PastMinutes
+from bms_estimator.forecast.load_history import MINUTE_S, PEAK_S, LoadHistory, PastMinutes
 from bms_estimator.kernels.trace import TRACE
 
 CAPACITY_AS = 3.0 * 3600.0

@@ -8,9 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bms_estimator.forecast.load_history import LoadHistory
-from bms_estimator.forecast.past_minutes import PastMinutes
-from bms_estimator.forecast.saved_load import load_arrays, restore_load
+from bms_estimator.forecast.load_history import LoadHistory, PastMinutes, load_arrays, restore_load
 from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
 from bms_estimator.kernels.trace import TRACE
 

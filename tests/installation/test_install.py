@@ -100,7 +100,7 @@ def test_upgrade_does_not_enable_a_disabled_service(root, pack, capsys):
 
 def test_other_settings_and_another_password_are_backed_up_for_root_and_the_service(root, pack, capsys):
     run(capsys, "install", "--root", root, pack)
-    pack.write_text(PACK.replace("house", "shed"))
+    pack.write_text(f"{PACK}# other\n")
     (pack.parent / "mqtt-password").write_text("changed")
     run(capsys, "install", "--root", root, pack)
     folder = root / "etc/bms-estimator"
@@ -109,6 +109,17 @@ def test_other_settings_and_another_password_are_backed_up_for_root_and_the_serv
     assert [(folder / name).read_text() for name in ("mqtt-password", "mqtt-password.old")] == ["changed", "secret"]
     status = (folder / "mqtt-password.old").stat()
     assert (stat.S_IMODE(status.st_mode), status.st_uid, status.st_gid) == (0o640, 0, group_of_service(root))
+
+
+def test_settings_of_another_pack_are_not_replaced_and_the_error_has_the_commands_for_both(root, pack, capsys):
+    run(capsys, "install", "--root", root, pack)
+    pack.write_text(PACK.replace("house", "shed"))
+    code, _, err = run(capsys, "install", "--root", root, pack)
+    assert code == 2
+    assert "is the pack house" in err
+    assert f"sudo install -m 640 -g bms-estimator {pack} /etc/bms-estimator/shed.toml" in err
+    assert "sudo systemctl enable --now bms-estimator@shed" in err
+    assert (root / "etc/bms-estimator/pack.toml").read_text() == PACK
 
 
 @pytest.mark.parametrize("place", ["root/etc/bms-estimator/mqtt-password", "mqtt-password"])

@@ -129,14 +129,21 @@ def cached_kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_another_installation_of_the_same_version_loads_the_cached_kernels(cached_kernel: Path, tmp_path: Path) -> None:
-    shutil.copytree(PACKAGE, tmp_path / "bms_estimator", ignore=shutil.ignore_patterns("__pycache__"))
+@pytest.mark.parametrize("shipped", [True, pytest.param(False, marks=pytest.mark.thorough)])
+def test_another_installation_of_the_same_version_loads_shipped_and_cached_kernels(
+    cached_kernel: Path, tmp_path: Path, shipped: bool
+) -> None:
+    shutil.copytree(PACKAGE, tmp_path / "bms_estimator", ignore=shutil.ignore_patterns("__pycache__", "compiled"))
+    cache = cached_kernel
+    if shipped:
+        shutil.copytree(cached_kernel, tmp_path / "bms_estimator" / "compiled")
+        cache = tmp_path / "empty"
     script = """
 import bms_estimator, numpy
 from bms_estimator.protocols.firmware.framing import crc16
 print(bms_estimator.__file__, crc16(numpy.zeros(4, "u1"), 0, 4), sum(crc16.stats.cache_misses.values()))
 """
-    variables = {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(cached_kernel)}
+    variables = {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(cache)}
     command = [sys.executable, "-P", "-c", script]  # -P: the working folder may contain the package, too
     output = subprocess.check_output(command, env=os.environ | variables, text=True)
     assert output == f"{tmp_path}/bms_estimator/__init__.py 33984 0\n"
@@ -175,20 +182,18 @@ def erase_machine_code(content: bytes) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("suffix", "damage"),
-    [  # numba writes an index (nbi) and the compiled code (nbc)
-        pytest.param("nbi", truncate, marks=pytest.mark.thorough),
-        pytest.param("nbi", empty, marks=pytest.mark.thorough),
-        pytest.param("nbc", truncate, marks=pytest.mark.thorough),
-        pytest.param("nbc", empty, marks=pytest.mark.thorough),
-        ("nbc", erase_machine_code),
+    "damage",
+    [
+        pytest.param(truncate, marks=pytest.mark.thorough),
+        pytest.param(empty, marks=pytest.mark.thorough),
+        erase_machine_code,
     ],
 )
 def test_a_damaged_kernel_in_the_cache_is_compiled_again(
-    tmp_path: Path, cached_kernel: Path, suffix: str, damage: Callable[[bytes], bytes]
+    tmp_path: Path, cached_kernel: Path, damage: Callable[[bytes], bytes]
 ) -> None:
     shutil.copytree(cached_kernel, tmp_path, dirs_exist_ok=True)
-    (file,) = tmp_path.rglob(f"*.{suffix}")
+    (file,) = tmp_path.rglob("*.nbc")
     size_before = file.stat().st_size
     file.write_bytes(damage(file.read_bytes()))
     assert "RuntimeWarning: a compiled kernel cannot be read" in run_crc16_with_cache_in(tmp_path)

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.arrays import fields
+from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack.state import PackState
 from bms_estimator.pack_model import learning
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.settings.pack import Settings
+from bms_estimator.simulation.simulated_pack import SimulatedPack as SimulatedLoad
+from bms_estimator.simulation.simulated_pack import constant
 from tests.pack_model.quick_fit import quick_fit
 from tests.simulated_pack import CAPACITY_AH, SimulatedPack
 
@@ -57,6 +60,30 @@ def test_estimates_forecasts_and_cells_do_not_depend_on_the_division_into_blocks
         assert other_forecasts == forecasts
         assert pack.cells
         assert pack.cells.cells.tobytes() == whole.cells.cells.tobytes()
+
+
+def test_the_soc_of_the_device_narrows_the_first_band_of_a_new_lfp_pack_unless_it_is_far_off() -> None:
+    """The prior gives equal estimates for any division into blocks. An SOC that contradicts the voltage does not move the SOC."""
+    settings = Settings.model_validate({"pack": {"cell": "lfp", "capacity_ah": 100, "device_soc_std": 0.1}})
+    model = load_cell("lfp", 100.0).pack(16, 1)
+    samples = np.zeros(120, SAMPLE)
+    samples["time_s"], samples["current_a"] = np.arange(120.0), 20.0
+    samples["voltage_v"], samples["temperature_c"] = SimulatedLoad(model, constant(20.0), soc=0.6)(60.0).voltage_v, 25.0
+    device_soc = np.full(120, np.nan)
+    device_soc[30:] = 0.62
+
+    def last_row(soc: np.ndarray, size: int) -> np.void:
+        pack = new_pack(settings, model)
+        for begin in range(0, samples.size, size):
+            part = slice(begin, begin + size)
+            trace = pack.run(samples[part], device_soc=soc[part]).trace
+        return trace[-1].copy()
+
+    without, whole, far = last_row(device_soc[:0], 120), last_row(device_soc, 120), last_row(device_soc * 0.0, 120)
+    assert whole["soc_std"] < 0.5 * without["soc_std"]
+    assert abs(whole["soc"] - 0.6) < whole["soc_std"]
+    assert last_row(device_soc, 7).tobytes() == last_row(device_soc, 1).tobytes() == whole.tobytes()
+    assert far["soc"] > 0.2
 
 
 def test_a_pack_without_forecasts_still_observes_the_load(recording: tuple[np.ndarray, np.ndarray]) -> None:

@@ -1,12 +1,10 @@
-"""Screenshots of the page for the documentation (``make screenshots``).
+"""Screenshots of the page for the documentation (``make screenshots``), of an LFP battery of a house with 16 cells.
 
-The page is that of a service of a simulated pack. Its history of the day before is simulated, too.
+The battery is simulated faster than real time, and its published snapshots are shown by the page of a service.
 """
 
 import asyncio
 import contextlib
-import itertools
-import math
 import sys
 import tempfile
 import time
@@ -15,70 +13,107 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import numpy as np
 from playwright.async_api import Browser
 
-from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.clock import Clock
+from bms_estimator.pack.pack import new_pack
+from bms_estimator.page.page_sink import Pages, PageSink
+from bms_estimator.service.publisher import Publisher
+from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.setup.page.setup_server import SetupServer
+from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
+from bms_estimator.sources.source import ReceivedSamples
+from tests.collector import Collector
 from tests.device_line import running_device
 from tests.free_port import free_port
-from tests.mosquitto import Broker
-from tests.page.chromium import PHONE, Tab, chromium, tab
-from tests.page.house import SERIES, Service, simulated
+from tests.page.chromium import DESKTOP, PHONE, Tab, chromium, tab
 from tests.page.test_setup import answer_questions, compare_voltage, search_and_choose
-from tests.sinks.snapshots import CELL_SNAPSHOT
+from tests.scripted_source import ScriptedSource
 from tests.store.test_history import record_history
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
-LEARN_S = 30.0
-"""Time before the screenshot with alarms in which the estimator identifies the pack [s]."""
-FORECAST_TIMEOUT_S = 600.0
-"""Timeout of the first curves of a forecast, which need 300 s of load [s]."""
+CELLS, CAPACITY_AH = 16, 280.0
+"""Number of cells, and their capacity [Ah]."""
+STEP_S, LIVE_S = 10.0, 600.0
+"""Interval of the samples, and duration at the end with a sample each second, which the live curves show [s]."""
+FULL_V = 3.5
+"""Voltage of a cell above which the charger reduces its current [V]."""
 TOP_PX = 500
 """Height of the upper part of the page, with alarms or the note about stale values [px]."""
-END_SOC = 0.66
-"""Approximate SOC at the end of the simulated day."""
-CAPACITY_AH = 30.0
-"""Capacity of the pack in ``tests.page.house``."""
-# limits at which the simulated pack raises both alarms
-ALARMS = """
-[alarms]
-cell_imbalance = {limit_v = 0.02, delay_s = 1, severity = "critical"}
-soc_low = {limit = 0.9, delay_s = 1}
-"""
+SETTINGS: dict[str, Any] = {
+    "pack": {"name": "home", "cell": "lfp", "capacity_ah": CAPACITY_AH, "series": CELLS, "device_soc_std": 0.1},
+    "sensor": {"protocol": "text", "voltage_resolution_v": 0.01, "current_resolution_a": 0.01},
+}
 
 
-def make_day_before() -> list[Snapshot]:
-    """Return the snapshots of the last 24 hours, one per minute. The pack is charged by day and discharged at night."""
-    assert CELL_SNAPSHOT.estimate
-    times = [time.time() - 60.0 * minute for minute in range(24 * 60, 0, -1)]
-    currents = [_current_a(time_s) for time_s in times]
-    soc_changes = [-charge_a_min / 60.0 / CAPACITY_AH for charge_a_min in itertools.accumulate(currents)]
-    snapshots = []
-    for time_s, current_a, soc_change in zip(times, currents, soc_changes, strict=True):
-        soc = END_SOC + soc_change - soc_changes[-1]
-        voltage_v = SERIES * (3.35 + 0.75 * soc - 5e-3 * current_a)  # roughly an NMC cell
-        values = {
-            "time": iso_utc(time_s),
-            "board_time_s": time_s,
-            "voltage_v": voltage_v,
-            "current_a": current_a,
-            "power_w": voltage_v * current_a,
-            "soc": soc,
-            "soc_std": 0.012,
-            "temperature_c": 24.0 - 0.5 * current_a,
-        }
-        snapshots.append(CELL_SNAPSHOT._replace(estimate=CELL_SNAPSHOT.estimate.model_copy(update=values)))
-    return snapshots
+class House:
+    """Battery of a house, its estimator, and the page that shows it.
 
+    Args:
+        days: Duration of the simulation [days].
+        soc: SOC at its start.
+        hour: Hour of the day at its end.
+        settings: Sections that differ from ``SETTINGS``.
+    """
 
-def _current_a(time_s: float) -> float:
-    """Return the current of a house with a solar generator, which charges for 8 h a day."""
-    hour = time_s % 86_400 / 3600.0
-    return 0.9 + 0.3 * math.sin(time_s / 700.0) - 4.0 * max(0.0, 1.0 - ((hour - 12.5) / 4.0) ** 2)
+    def __init__(self, days: float, soc: float, hour: float, **settings: Any) -> None:
+        self.rng = np.random.default_rng(3)
+        cells = BankCells.drawn(self.rng, CELLS, 0.97 * CAPACITY_AH, soc)
+        self.bank = SimulatedBank(load_cell("lfp", CAPACITY_AH), cells)
+        self.settings = Settings.model_validate(SETTINGS | settings)
+        self.pack = new_pack(self.settings, load_cell("lfp", CAPACITY_AH).pack(CELLS, 1))
+        self.days, self.hour, self.time_s, self.charger_a = days, hour, 0.0, 0.0
+        self.begin_s = time.time() - 86_400.0 * days
+        self.collector = Collector()
+
+    @contextlib.asynccontextmanager
+    async def page(self, folder: Path) -> AsyncIterator[str]:
+        """Simulate the battery, and serve its page. Yield the URL."""
+        page, history = PageSettings(listen=f"127.0.0.1:{free_port()}"), folder / f"{free_port()}.sqlite"
+        async with PageSink(Pages(), page, "home", history) as sink:
+            clock = Clock(wall=lambda: self.begin_s + self.time_s, monotonic=lambda: self.time_s)
+            publisher = Publisher(
+                self.settings, self.pack, source=ScriptedSource(), sinks=[self.collector, sink], clock=clock
+            )
+            while self.time_s < 86_400.0 * self.days - LIVE_S:
+                self.run(publisher, STEP_S)
+            while self.time_s < 86_400.0 * self.days:
+                self.run(publisher, 1.0)
+            publisher.publish_last()
+            day = [each for each in self.collector.snapshots if each.estimate][-1440 - int(LIVE_S) :]
+            await record_history(history, day)
+            yield f"http://{page.listen}/"
+
+    def run(self, publisher: Publisher, step_s: float) -> None:
+        """Simulate a minute, and publish its samples."""
+        count = round(60.0 / step_s)
+        history = self.bank.run(
+            self.current_a() + 3.0 * self.rng.standard_normal(count) * (self.charger_a < 9.0), step_s
+        )
+        self.charger_a *= 0.7 if history.cell_v.max() > FULL_V else 1.0
+        samples, soc = history.samples(self.rng, 2e-3, 0.01), float(self.bank.soc.mean())
+        cells_v = np.round(history.cell_v + 5e-4 * self.rng.standard_normal(history.cell_v.shape), 3)
+        device_soc = np.full(count, round(min(soc + 0.04, 1.0), 2))
+        size = 1 if step_s == 1.0 else count  # one publication a minute before the end
+        for i in range(0, count, size):
+            part = slice(i, i + size)
+            self.time_s = float(samples["time_s"][part][-1])
+            received = ReceivedSamples(samples[part], cells_v[part], device_soc=device_soc[part])
+            publisher.add(received, self.pack.run(received.samples, received.cells_v, received.device_soc))
+        self.time_s += step_s
+
+    def current_a(self) -> float:
+        """Return the current of the house [A]: the sun charges it from 8 to 16 h until it is full."""
+        hour = (self.hour + (self.time_s - 86_400.0 * self.days) / 3600.0) % 24.0
+        if not 8.0 <= hour < 16.0:
+            self.charger_a = 70.0
+            return 8.0 + 4.0 * float(np.sin(self.time_s / 3000.0))
+        return -self.charger_a if self.charger_a > 4.0 else 0.0
 
 
 async def shoot(page_tab: Tab, name: str, part: str = "", *, top: bool = False) -> None:
@@ -87,41 +122,61 @@ async def shoot(page_tab: Tab, name: str, part: str = "", *, top: bool = False) 
     if part:
         await page_tab.page.locator(part).screenshot(path=path)
     else:
-        await page_tab.page.screenshot(
-            path=path, clip={"x": 0, "y": 0, "width": 1280, "height": TOP_PX} if top else None
-        )
+        clip = {"x": 0, "y": 0, "width": DESKTOP["width"], "height": TOP_PX}
+        await page_tab.page.screenshot(path=path, **({"clip": clip} if top else {"full_page": True}))
     sys.stdout.write(f"{path.relative_to(DOCS.parents[1])}: {path.stat().st_size / 1e3:.0f} kB\n")
 
 
 @contextlib.asynccontextmanager
-async def open_page(browser: Browser, service: Service, **options: Any) -> AsyncIterator[Tab]:
+async def open_page(browser: Browser, url: str, **options: Any) -> AsyncIterator[Tab]:
     """Open the page and wait until its curves are drawn."""
-    async with tab(browser, service.url, **options) as page_tab:
+    async with tab(browser, url, **options) as page_tab:
         await page_tab.until_status("live")
         await page_tab.until("() => document.querySelectorAll('.curve [aria-label]').length >= 4")
         yield page_tab
 
 
-async def shoot_all(service: Service, browser: Browser) -> None:
-    """Write all screenshots. The service is killed for one of them, and restarted with alarms."""
-    async with open_page(browser, service) as page_tab:
-        await page_tab.page.locator("#forecast .curve").last.wait_for(timeout=1e3 * FORECAST_TIMEOUT_S)
-        await shoot(page_tab, "desktop")
-        await shoot(page_tab, "cells", ".cells")
-        await page_tab.page.get_by_text("Day", exact=True).click()
-        await page_tab.page.get_by_role("img", name="Voltage, last day: from").wait_for()
-        await shoot(page_tab, "day", ".curves")
-    async with open_page(browser, service, size=PHONE, device_scale_factor=1.5) as page_tab:
-        await shoot(page_tab, "phone")
-    async with open_page(browser, service, color_scheme="dark") as page_tab:
-        await shoot(page_tab, "dark")
-        await service.kill()
+async def shoot_first_day(folder: Path, browser: Browser) -> None:
+    """Write screenshots of the first minutes, in which the SOC is not known without that of the BMS, and is with it."""
+    for name, std in (("unknown", None), ("first", 0.1)):
+        pack = {key: value for key, value in SETTINGS["pack"].items() if key != "device_soc_std" or std}
+        async with House(0.02, 0.55, 20.0, pack=pack).page(folder) as url, open_page(browser, url) as page_tab:
+            await shoot(page_tab, f"{name}", top=True)
+
+
+async def shoot_weeks(folder: Path, browser: Browser) -> None:
+    """Write screenshots of a pack after a week, discharging."""
+    async with House(7.0, 0.6, 20.0).page(folder) as url:
+        async with open_page(browser, url) as page_tab:
+            await shoot(page_tab, "desktop")
+            await shoot(page_tab, "cells", ".cells")
+            await page_tab.page.get_by_text("Day", exact=True).click()
+            await page_tab.page.get_by_role("img", name="Voltage, last day: from").wait_for()
+            await shoot(page_tab, "day", ".curves")
+            await page_tab.page.get_by_text("For experts").click()
+            await page_tab.page.locator("#params tr").nth(3).wait_for()
+            await shoot(page_tab, "expert", "#expert")
+        async with open_page(browser, url, size=PHONE, device_scale_factor=1.5) as page_tab:
+            await shoot(page_tab, "phone")
+        async with open_page(browser, url, color_scheme="dark") as page_tab:
+            await shoot(page_tab, "dark")
+    # the page is open while its service ends
+    async with contextlib.AsyncExitStack() as stack:
+        service = contextlib.AsyncExitStack()
+        url = await service.enter_async_context(House(0.1, 0.6, 20.0).page(folder))
+        page_tab = await stack.enter_async_context(open_page(browser, url))
+        await service.aclose()
         await page_tab.until_status("stale since")
         await shoot(page_tab, "stale", top=True)
-    await service.start(ALARMS)
-    async with open_page(browser, service) as page_tab:
-        await page_tab.page.locator(".alarm").nth(1).wait_for()
-        await asyncio.sleep(LEARN_S)
+
+
+async def shoot_states(folder: Path, browser: Browser) -> None:
+    """Write screenshots of a pack that is charged, and of one with alarms."""
+    async with House(1.0, 0.6, 11.0).page(folder) as url, open_page(browser, url) as page_tab:
+        await shoot(page_tab, "charging", top=True)
+    alarms = {"soc_low": {"limit": 0.9, "delay_s": 1}, "cell_imbalance": {"limit_v": 0.002, "delay_s": 1}}
+    async with House(1.0, 0.5, 6.0, alarms=alarms).page(folder) as url, open_page(browser, url) as page_tab:
+        await page_tab.page.locator(".alarm").first.wait_for()
         await shoot(page_tab, "alarm", top=True)
 
 
@@ -147,17 +202,8 @@ async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         async with chromium() as browser:
-            await shoot_setup(folder, browser)
-        broker = Broker(folder).start()
-        try:
-            async with Service(folder, broker, free_port(), simulated(soc=END_SOC)) as service, chromium() as browser:
-                # after the first start, because a history without saved alarms would raise alarm_state_lost
-                await service.kill()
-                await record_history(folder / "attic.sqlite", make_day_before())
-                await service.start()
-                await shoot_all(service, browser)
-        finally:
-            broker.stop()
+            for shots in (shoot_first_day, shoot_states, shoot_weeks, shoot_setup):
+                await shots(folder, browser)
 
 
 if __name__ == "__main__":

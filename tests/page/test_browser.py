@@ -58,6 +58,7 @@ STATE_VALUES = {  # as published in ``state``
     "delta_2": 0.0789,
     "weakest_cell_soc": 0.3871,
     "weakest_cell_soc_std": 0.0184,
+    "device_soc": 0.41,
     "stability_margin": 0.3532,
     "nussbaum_gain": 0.97,
     "stability_margin_std": 0.021,
@@ -67,30 +68,23 @@ SHOWN_TEXTS = {  # by quantity (attribute ``data-q``)
     "soc": "43.2",
     "soc_std": "2.5",  # two std in percent
     "voltage_v": "52.35 V",
-    "voltage_estimate_v": "52.40 V",
     "current_a": f"{MINUS}12.35 A",
     "way": "charging",
     "power_w": f"{MINUS}646 W",
     "temperature_c": "21.4 °C",
-    "innovation_v": f"{MINUS}54.3 mV",
-    "innovation_of": f"measured {MINUS} predicted",
     "remaining_energy_wh": "2346 Wh",
     "remaining_capacity_ah": "45.68 Ah",
     "time_left": "3 h 12 min",
     "time_left_label": "To full",
     "energy_out_kwh": "12.35 kWh",
     "energy_in_kwh": "123.5 kWh",
-    "invalid_below": "7.9",
-    "deltas": "δ₁ 3.1 %, δ₂ 7.9 %",
+    "device_soc": "41",
     "weakest_cell_soc": "38.7",
     "weakest_cell_soc_std": "3.7",  # two std in percent
-    "stability_margin": "35.3",
-    "stability_margin_std": "4.2",  # two std in percent
     "celllow": "3.269 V · cell 4",
     "cellhigh": "3.276 V · cell 2",
-    "cellmean": "3.272 V",
     "cellapart": "6.7 mV",
-    "cellspread": "3 measured · deviations in mV",
+    "cellspread": "3 measured",
 }
 
 
@@ -182,6 +176,7 @@ async def test_page_shows_the_published_values_with_units(browser: Browser, prog
         await publish_state(programs.live, **STATE_VALUES)
         await page_tab.until_text("soc", SHOWN_TEXTS["soc"])
         assert {name: await page_tab.text(name) for name in SHOWN_TEXTS} == SHOWN_TEXTS
+        await page_tab.page.get_by_text("For experts").click()
         gain = page_tab.page.locator("#facts div", has_text="Observer, N(k)")
         assert await gain.inner_text() == "Observer, N(k)\n0.97"
         meter = page_tab.page.get_by_role("meter", name="State of charge")
@@ -257,20 +252,17 @@ async def test_unknown_values_are_hidden(browser: Browser, programs: RunningProg
         assert page_tab.errors == []
 
 
-async def test_the_limit_of_the_model_is_marked_only_with_a_margin_and_is_no_instruction(
+async def test_values_of_the_model_are_one_tap_away_from_the_page_of_the_owner(
     browser: Browser, programs: RunningPrograms
 ) -> None:
     async with dashboard_of(browser, programs, "cellar") as page_tab:
-        page = page_tab.page
-        for margin in (0.3532, None, 0.3532):
-            is_shown = margin is not None
-            values = {"delta_1": -0.0205, "delta_2": 0.0789, "stability_margin": margin}
-            await publish_state(programs.live, **STATE_VALUES | values)
-            await page.locator("#invalidmark").wait_for(state="visible" if is_shown else "hidden")
-            assert await page.get_by_text("the thesis's model is not valid below 7.9 %").is_visible() is is_shown
-            meter_text = await page.get_by_role("meter", name="State of charge").get_attribute("aria-valuetext")
-            assert ("the thesis's model is not valid below 8 %" in (meter_text or "")) is is_shown
-            assert "stop discharging" not in await page.inner_text(".hero")
+        await publish_state(programs.live, **STATE_VALUES | {"delta_1": -0.0205, "delta_2": 0.0789})
+        await page_tab.until_text("soc", SHOWN_TEXTS["soc"])
+        model = {"innovation_v", "stability_margin", "invalid_below", "voltage_estimate_v"}
+        assert {await page_tab.text(name) for name in model} == {""}
+        await page_tab.page.get_by_text("For experts").click()
+        await page_tab.until_text("invalid_below", "7.9")
+        assert "" not in {await page_tab.text(name) for name in model}
         assert page_tab.errors == []
 
 
@@ -281,6 +273,7 @@ async def test_lock_and_e_of_the_observer_are_shown_under_its_name_and_not_on_th
         page = page_tab.page
         observer = {"lock": True, "converged": False, "tracking_error_v": -0.0027, "nussbaum_gain": 0.8}
         await publish_state(programs.live, **STATE_VALUES | observer | {"soc_std": None})  # without the identifier
+        await page.get_by_text("For experts").click()
         await page_tab.until_text("innovation_of", "of the observer")
         await publish_state(programs.live, **STATE_VALUES | observer)
         row = page.locator("#facts div").filter(has=page.get_by_text("Observer", exact=True))
@@ -301,14 +294,13 @@ async def test_an_soc_that_is_not_known_is_not_shown_as_a_number(browser: Browse
         assert page_tab.errors == []
 
 
-async def test_cells_are_ranked_by_soc_and_the_weakest_is_named(browser: Browser, programs: RunningPrograms) -> None:
+async def test_the_weakest_and_faulty_cells_are_named(browser: Browser, programs: RunningPrograms) -> None:
     async with dashboard_of(browser, programs, "cellar") as page_tab:
         await publish_state(programs.live, **STATE_VALUES)
         await publish(programs.live, "cells", CELLS_REPORT.model_dump_json(), retain=False)
-        await page_tab.until_text("weakestcell", "cell 2, SOC 47.0 ± 2.0 %")
-        rows = page_tab.page.locator("#cellranks tbody tr")
-        assert [await rows.nth(i).get_attribute("data-cell") for i in range(4)] == ["2", "3", "1", "4"]
-        assert await rows.nth(0).locator("td").last.inner_text() == "internal short"
+        name = page_tab.page.locator("[data-q=weakestcell]")
+        await name.get_by_text("cell 2, SOC 47.0 ± 2.0 %").wait_for()
+        assert (await name.inner_text()).endswith("; cell 2: internal short")
         assert page_tab.errors == []
 
 
@@ -333,6 +325,8 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
             await page_tab.until(
                 "count => document.querySelectorAll('#params tr').length === count", count_parameters(parameters)
             )
+            assert await page_tab.text("capacity_health") == "not known yet"
+            await page_tab.page.get_by_text("For experts").click()
             row = page_tab.page.locator('[data-p="a a1"]')
             text = (await row.locator("td").nth(0).inner_text()).replace(MINUS, "-")
             await programs.live.wait_json("bms/attic/parameters", lambda p: format_parameter(p["a"]["a1"]) == text)  # noqa: B023
@@ -372,6 +366,9 @@ async def test_packs_spans_and_elements_are_selected_by_keyboard(browser: Browse
         await page.keyboard.press("ArrowRight")
         assert await page.get_by_role("radio", name="Hour").is_checked()
         await page.keyboard.press("ArrowLeft")
+        await page.keyboard.press("Tab")
+        assert await page.evaluate("document.activeElement.textContent") == "For experts"
+        await page.keyboard.press("Enter")
         await page.keyboard.press("Tab")
         assert await page.evaluate("document.activeElement.id") == "element"
 

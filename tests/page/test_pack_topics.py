@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.page.event_stream import MAX_MESSAGE_BYTES, Reader
 from bms_estimator.page.pack_topics import RECENT_STATES, PackTopics
-from bms_estimator.store.minute import epoch_s
+from bms_estimator.store.history import epoch_s
 
 TIME = "2026-11-22T16:00:{:06.3f}Z"
 

@@ -20,7 +20,7 @@ from bms_estimator.page.page_server import FILES, STATIC, PageServer
 from bms_estimator.page.page_sink import Pages, PageSink
 from bms_estimator.process import listener
 from bms_estimator.settings.page import PageSettings
-from bms_estimator.store.minute import epoch_s
+from bms_estimator.store.history import epoch_s
 from tests.patience import LONG_S
 from tests.sinks.snapshots import CELL_SNAPSHOT
 from tests.store.test_history import record_history, snapshot_at

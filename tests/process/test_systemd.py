@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.process.systemd import SystemdNotifier, extend_start
 
 
 @pytest.fixture
@@ -49,3 +49,11 @@ def test_watchdog_of_another_process_is_ignored() -> None:
     environment = {"WATCHDOG_USEC": "3000000", "WATCHDOG_PID": str(os.getpid())}
     assert SystemdNotifier(["a"], environment).watchdog_s == 3.0
     assert SystemdNotifier(["a"], environment | {"WATCHDOG_PID": "1"}).watchdog_s == 0.0
+
+
+def test_a_long_start_extends_its_timeout(
+    tmp_path: Path, systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    extend_start("compiling kernels: 3 of 9")
+    assert receive_states(systemd) == ["EXTEND_TIMEOUT_USEC=120000000\nSTATUS=compiling kernels: 3 of 9"]

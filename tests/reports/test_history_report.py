@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.reports.aging_group import AgingHistory
 from bms_estimator.reports.formats import duration_text
 from bms_estimator.reports.history_report import PackHistory, history_report
-from bms_estimator.store.minute import Minute
+from bms_estimator.store.history import Minute
 
 
 def history_of(time_s, **columns):

@@ -33,7 +33,7 @@ from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sources.source import ReceivedSamples
-from bms_estimator.telemetry.rest_detector import REST_S
+from bms_estimator.telemetry.publish_window import REST_S
 from tests.collector import Collector
 from tests.patience import LONG_S, until
 from tests.scripted_source import ScriptedSource

@@ -9,10 +9,9 @@ import pytest
 
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service import publisher
-from bms_estimator.service.latency import Latency
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.service.pack_service import recording_health
-from bms_estimator.service.service_status import ServiceStatus
+from bms_estimator.service.service_status import Latency, ServiceStatus
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder

@@ -3,6 +3,7 @@
 import pytest
 
 from bms_estimator.setup import search as search_module
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.search import search
 from tests.free_port import free_port
 from tests.mosquitto import Broker
@@ -29,7 +30,7 @@ async def test_a_broker_without_a_known_publisher_is_reported_and_offered_for_pu
     result = await search([broker.url])
     assert result.devices == []
     assert result.failures == [f"{broker.url}: no message of a known publisher within 0.5 s"]
-    assert result.broker == broker.url
+    assert result.broker == BrokerLogin(broker.url)
 
 
 async def test_a_missing_broker_is_reported_with_the_reason() -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.setup.answers import Answers
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.new_pack import create_pack
 from bms_estimator.setup.page import session as session_module
@@ -14,7 +15,7 @@ from bms_estimator.setup.page.session import SetupSession
 
 def test_invalid_settings_leave_no_file(tmp_path):
     device = FoundDevice("/dev/none", "JK-BMS", {"sensor": {"port": "/dev/none", "protocol": "jk"}})
-    answers = Answers(device, None, "house", "lfp", 100.0, 8, 1, broker="mqtt://localhost:99999")
+    answers = Answers(device, None, "house", "lfp", 100.0, 8, 1, broker=BrokerLogin("mqtt://localhost:99999"))
     with pytest.raises(UserError, match="Port out of range"):
         create_pack(tmp_path / "pack.toml", answers)
     assert not list(tmp_path.iterdir())

@@ -13,9 +13,8 @@ from bms_estimator.model.payloads.snapshot import Alarm, CellReport, CellsReport
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
 from bms_estimator.telemetry.health import make_health_payload
-from bms_estimator.telemetry.lifetime_totals import new_totals
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.state import make_forecast_payload, make_info_payload, make_state_payload, no_forecast

@@ -15,9 +15,8 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.store import database as database_module
 from bms_estimator.store import history as history_module
 from bms_estimator.store.database import Database, StoreError
-from bms_estimator.store.history import HistorySink
+from bms_estimator.store.history import HistorySink, Minute
 from bms_estimator.store.history_reader import HistoryReader, PastEvent
-from bms_estimator.store.minute import Minute
 from tests.doctor.as_user import as_nobody
 from tests.patience import LONG_S, until
 from tests.sinks.snapshots import CELL_SNAPSHOT

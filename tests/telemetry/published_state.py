@@ -3,7 +3,7 @@
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.state import make_state_payload, no_forecast
 from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah

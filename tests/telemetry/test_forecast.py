@@ -7,9 +7,8 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import ForecastReport
-from bms_estimator.telemetry.cutoff_text import cutoff_text
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
-from bms_estimator.telemetry.state import NAMES, forecast_fields, make_forecast_payload, no_forecast
+from bms_estimator.telemetry.state import NAMES, cutoff_text, forecast_fields, make_forecast_payload, no_forecast
 from tests.sinks.snapshots import CUTOFF_V, NOW, forecast_at
 
 FORECAST = forecast_at(600.0)

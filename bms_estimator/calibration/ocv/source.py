@@ -35,12 +35,14 @@ class ExternalCurve:
         soc: Shape (n,), increasing, 0..1.
         ocv_v: Shape (n,), open-circuit voltage [V].
         hysteresis_v: Shape (n,), hysteresis [V]; None if unknown.
+        std_v: Shape (n,), std of ``ocv_v`` [V]; None if unknown.
     """
 
     name: str
     soc: Floats
     ocv_v: Floats
     hysteresis_v: Floats | None
+    std_v: Floats | None = None
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from bms_estimator.calibration.ocv.hysteresis import (
     REST_SHARE_STD,
     centered,
     find_hysteresis_source,
+    has_plateau,
     hysteresis_factor,
     measured_share,
     typical_share,
@@ -30,6 +31,10 @@ GIVEN_V = 1e-3
 """Std of each point of a given curve, per cell [V]."""
 GIVEN_SYSTEMATIC_V = 2e-3
 """Std of the systematic error of a given curve, per cell [V]."""
+PLATEAU_SYSTEMATIC_V = 0.01
+"""Std of the systematic error of a given curve with a plateau, per cell [V]. Such a curve is mostly a quasi-OCV: the mean of a slow
+charge and a slow discharge, or one of both. On the plateau it is beside the rested OCV by part of the hysteresis and of the
+overpotential, and a millivolt is 1 % of SOC."""
 MAX_CAPACITY_DIFFERENCE = 0.05
 """Relative difference between the given and the measured capacity above which a source has a remark."""
 
@@ -127,7 +132,11 @@ def _slow_curve_source(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> 
 def _given_curve_source(curve: ExternalCurve, series_count: int) -> Source:
     """Return a given curve as a source."""
     everywhere = np.full(curve.soc.size, float(series_count))
-    points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, systematic_std_v=GIVEN_SYSTEMATIC_V * everywhere)
+    is_flat = has_plateau(curve.soc, curve.ocv_v, series_count)
+    systematic_v = (PLATEAU_SYSTEMATIC_V if is_flat else GIVEN_SYSTEMATIC_V) * everywhere
+    if curve.std_v is not None:
+        systematic_v = curve.std_v
+    points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, systematic_std_v=systematic_v)
     hysteresis_v = None
     if curve.hysteresis_v is None:
         points = replace(points, direction=np.full(curve.soc.size, -1.0))

@@ -24,10 +24,10 @@ from bms_estimator.cli.options.capture_options import (
     SocOfEstimator,
     complete_cell,
 )
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
-from bms_estimator.cli.options.silenced_log import silenced_log
+from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.pack_model import PackModel
@@ -94,10 +94,8 @@ def alarms(
         reject_soc_for_fuel_cell(model, "--soc")
         settings = with_pack(settings, initial_soc=soc)
     with silenced_log(), capture_file(capture) as path:
-        with show_compile_progress():
-            opened = open_capture(
-                path, settings.sensor if pack else None, current_sign=current_sign, column_map=column_map
-            )
+        compile_ahead()
+        opened = open_capture(path, settings.sensor if pack else None, current_sign=current_sign, column_map=column_map)
         print_guesses(path.name, opened)
         source = Replay(opened, max_block_s=MAX_BLOCK_S)
         result = asyncio.run(_evaluate(settings, model, source))
@@ -112,9 +110,8 @@ def alarms(
 async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> AlarmResult:
     """Run estimator and alarms over a capture."""
     now_s, changes = 0.0, list[Change]()
-    with show_compile_progress():
-        pack = new_pack(settings, model)
-        load_forecast_kernels()
+    pack = new_pack(settings, model)
+    load_forecast_kernels()
     without_hooks = settings.alarms.model_copy(update={"hook": ()})
     settings = settings.model_copy(update={"alarms": without_hooks})
     clock = Clock(wall=lambda: now_s, monotonic=lambda: now_s)  # the capture's clock
@@ -123,7 +120,7 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
         async for each in source:
             received = each._replace(cells_v=slots.select(each.cells_v))
             now_s = max(now_s, float(received.samples["time_s"][-1]))
-            monitor.add(received, pack.run(received.samples, received.cells_v), now_s, slots.fault)
+            monitor.add(received, pack.run(received.samples, received.cells_v, received.device_soc), now_s, slots.fault)
             bar.update(source.fraction)
     if slots.reason:
         typer.echo(f"warning: no estimates of single cells: {slots.reason}", err=True)

@@ -10,7 +10,7 @@ from bms_estimator.calibration.soc_errors import BLOCK_SAMPLES, first_time_s, so
 from bms_estimator.calibration.validate import Validation, validate
 from bms_estimator.calibration.verdict import is_fitted_to
 from bms_estimator.cli.options.capture_input import read_with_bar
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.arrays import Floats
@@ -56,13 +56,13 @@ def capture_result(
     Raises:
         UserError: The capture cannot be read, or does not belong to the cell.
     """
-    with show_compile_progress():
-        rows = read_with_bar(file, opened)
-        quality = data_quality(rows)  # first, because it needs memory for copies of columns
-        is_fitted = is_fitted_to(model, rows)
-        fill_temperature(rows, temperature_c)
-        validation = validate(Columns(rows, name), model, initial_soc=initial_soc)
-        pack = new_pack(settings, model, has_forecasts=False)
+    compile_ahead()
+    rows = read_with_bar(file, opened)
+    quality = data_quality(rows)  # first, because it needs memory for copies of columns
+    is_fitted = is_fitted_to(model, rows)
+    fill_temperature(rows, temperature_c)
+    validation = validate(Columns(rows, name), model, initial_soc=initial_soc)
+    pack = new_pack(settings, model, has_forecasts=False)
     with progress_bar(f"estimating {name}") as bar:
         estimates = _estimate(pack, rows, validation, bar.update)
     raw = opened if isinstance(opened, RawCapture) else None

@@ -31,7 +31,7 @@ from bms_estimator.cli.options.capture_options import (
     check_output_file,
     complete_cell,
 )
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_broker, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
@@ -54,8 +54,8 @@ from bms_estimator.sources.captures.replay import RawCapture, Replay, no_samples
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.store.outbox import Outbox
 from bms_estimator.telemetry.cells import cell_columns
-from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
+from bms_estimator.telemetry.state import CUTOFF_FIELDS, cutoff_text
 
 CELLS_S = 10.0
 """Interval at which the columns of the cells are updated [s]. It equals the averaging window of the cell estimator."""
@@ -120,10 +120,8 @@ def replay(
     if out is not None:
         check_output_file(out, [capture], force=force)
     with capture_file(capture) as path:
-        with show_compile_progress():
-            source = open_capture(
-                path, settings.sensor if pack else None, current_sign=current_sign, column_map=column_map
-            )
+        compile_ahead()
+        source = open_capture(path, settings.sensor if pack else None, current_sign=current_sign, column_map=column_map)
         print_guesses(path.name, source)
         replay_source = Replay(source, speed=speed)
         table = table_sink(out) if out else None
@@ -159,16 +157,15 @@ async def _replay(
     if not fit_pack:
         identifier = settings.identifier.model_copy(update={"pack_model": False})
         settings = settings.model_copy(update={"identifier": identifier})
-    with show_compile_progress():
-        pack = new_pack(
-            settings,
-            model,
-            on_failure=lambda error: errors.update({type(error).__name__: str(error)}),
-            # forecasts at intervals take longer than the estimates, and the summary needs only the last one
-            has_forecasts=bool(table or settings.mqtt),
-        )
-        if pack.forecaster:
-            load_forecast_kernels()
+    pack = new_pack(
+        settings,
+        model,
+        on_failure=lambda error: errors.update({type(error).__name__: str(error)}),
+        # forecasts at intervals take longer than the estimates, and the summary needs only the last one
+        has_forecasts=bool(table or settings.mqtt),
+    )
+    if pack.forecaster:
+        load_forecast_kernels()
     summary, slots = Summary(), CellSlots(model.cell.series_count)
     async with AsyncExitStack() as stack:
         publisher = await _open_publisher(stack, settings, pack, source)
@@ -178,7 +175,7 @@ async def _replay(
         async for each in source:
             received = each._replace(cells_v=slots.select(each.cells_v))
             for part in rows.parts(received):
-                step = pack.run(part.samples, part.cells_v)
+                step = pack.run(part.samples, part.cells_v, part.device_soc)
                 summary.add(step.trace)
                 rows.add(step)
                 if step.trace.size < part.samples.size:  # samples were dropped
@@ -221,7 +218,9 @@ class _TableRows:
         edges = [0, *(np.flatnonzero(changes) + 1).tolist(), received.samples.size]
         for begin, end in itertools.pairwise(edges):
             part = slice(begin, end)
-            yield ReceivedSamples(received.samples[part], received.cells_v[part], received.probes[part])
+            yield ReceivedSamples(
+                received.samples[part], received.cells_v[part], received.probes[part], received.device_soc[part]
+            )
 
     def add(self, step: Step) -> None:
         """Append the rows of a part."""

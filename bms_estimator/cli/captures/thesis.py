@@ -30,8 +30,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.reports.thesis import report_items
 from bms_estimator.reports.thesis.experiment import Recorded
-from bms_estimator.reports.thesis.page import LONG_CELL, write
-from bms_estimator.reports.thesis.report import Report, build
+from bms_estimator.reports.thesis.report import LONG_CELL, Report, build, write
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 MIN_TABLE_WIDTH = 160

@@ -28,7 +28,7 @@ from bms_estimator.cli.options.capture_options import (
     TemperatureWithoutSensor,
     check_output_file,
 )
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
@@ -79,8 +79,8 @@ def validate_command(
         check_output_file(out, [capture], force=force)
     residual_sink = table_sink(out) if out else None
     validation = validate(loaded, model, initial_soc=soc)
-    with show_compile_progress():
-        pack = new_pack(settings, model, has_forecasts=False)
+    compile_ahead()
+    pack = new_pack(settings, model, has_forecasts=False)
     with progress_bar("estimating") as bar:
         errors = soc_errors(pack, loaded.rows, validation, lambda _trace, _counted, fraction: bar.update(fraction))
     verdict = judge([Run(loaded.name, validation, errors, is_fitted)], model)

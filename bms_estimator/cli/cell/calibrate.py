@@ -42,8 +42,8 @@ from bms_estimator.cli.options.capture_options import (
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.cell import fitted_to
-from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.config_file import write_text
+from bms_estimator.model.pack_model import write_cell
 from bms_estimator.model.sample import capture_digest, fill_temperature
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.sources.captures.curves import read_curve

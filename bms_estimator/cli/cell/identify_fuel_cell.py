@@ -19,9 +19,9 @@ from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import name_of, unique_names
 from bms_estimator.kernels.kalman_filter.temperature import MAX_PLAUSIBLE_C, MIN_PLAUSIBLE_C
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
+from bms_estimator.model.pack_model import write_cell
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.captures.curves import read_polarisation
 from bms_estimator.sources.captures.tables.layout import ColumnMap

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.page_options import open_browser
 from bms_estimator.fleet.demo.demo import Demo, run_demo
@@ -36,8 +36,8 @@ def demo(
     The end is a table of measured results.
     All parts are processes on the loopback interface, with free ports and a temporary folder.
     """
-    with show_compile_progress():
-        load_fleet_kernels()
+    compile_ahead()
+    load_fleet_kernels()
     with tempfile.TemporaryDirectory(prefix="fleet-demo-") as folder:
         opened = open_browser if browser else _ignore_url
         asyncio.run(_run(Demo(packs, seconds, page_port or free_port(), Path(folder), typer.echo, opened)))

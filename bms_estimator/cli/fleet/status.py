@@ -8,11 +8,16 @@ import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.cli.options.table import counted, print_table
+from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
     from bms_estimator.fleet.heartbeat import Heartbeat
     from bms_estimator.fleet.nats.dead_packs import DeadPacks
 
+STREAMS_S = 10.0
+"""Timeout of the requests to the streams [s]."""
+MIN_CLOCKS = 2
+"""Number of packs of a worker above which errors of most clocks prove that the server's clock is wrong."""
 COLUMNS = ("worker", "version", "partitions", "packs", "lag s", "checkpoint formats", "block version")
 
 
@@ -31,21 +36,19 @@ def status(
 ) -> None:
     """List the workers with their versions, and what needs attention.
 
-    Listed are refused partitions, packs with dead letters, and packs whose edge's clock is wrong. A warning follows if more than
-    half of the stream is filled by blocks that no checkpoint includes.
+    Listed are errors of workers, refused partitions, unknown packs that send blocks, packs with dead letters, and packs whose edge's
+    clock is wrong. A warning follows if more than half of the stream is filled by blocks that no checkpoint includes.
     """
     heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
-    warning, dead_packs = asyncio.run(_read_streams((server, creds, ca)))
     print_table(COLUMNS, [_row(each) for each in heartbeats])
     for heartbeat in heartbeats:
-        for line in (*_refusals(heartbeat), *_clock_errors(heartbeat)):
+        trouble = [f"{heartbeat.id}: {heartbeat.trouble}"] if heartbeat.trouble else []
+        for line in (*trouble, *_refusals(heartbeat), *_unknown_packs(heartbeat), *_clock_errors(heartbeat)):
             typer.echo(line)
-    for line in _dead_letters(dead_packs):
-        typer.echo(line)
     if not heartbeats:
         typer.echo("no worker")
-    if warning:
-        typer.echo(warning)
+    for line in asyncio.run(_stream_lines((server, creds, ca))):
+        typer.echo(line)
     if blocks is not None:
         _check_block_version(heartbeats, blocks)
 
@@ -59,6 +62,17 @@ def _refusals(heartbeat: "Heartbeat") -> list[str]:
     ]
 
 
+def _unknown_packs(heartbeat: "Heartbeat") -> list[str]:
+    """Return a line for each listed pack that sends blocks without a valid row in the table."""
+    lines = [
+        f"{pack}: unknown pack that sends blocks, which wait: it is not in the table of packs, or its row is wrong; "
+        "`fleet packs list` prints the errors, `fleet packs load` adds rows"
+        for pack in heartbeat.unknown
+    ]
+    more = heartbeat.unknown_count - len(lines)
+    return [*lines, f"{heartbeat.id}: {counted(more, 'more unknown pack')}"] if more > 0 else lines
+
+
 def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
     """Return a line for each listed pack with dead letters."""
     lines = [
@@ -70,6 +84,11 @@ def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
 
 def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
     """Return a line for each listed pack whose edge's clock is wrong, the largest error first."""
+    if 2 * heartbeat.clock_error_count > heartbeat.packs > MIN_CLOCKS:
+        clocks = counted(heartbeat.clock_error_count, "edge")
+        return [
+            f"{heartbeat.id}: the clocks of {clocks} of {heartbeat.packs} differ from the server's: check the clocks of its nodes"
+        ]
     largest = sorted(heartbeat.clock_errors.items(), key=lambda each: -abs(each[1]))
     lines = [
         f"{pack}: the clock of its edge is {timedelta(seconds=round(abs(error_s)))} "
@@ -103,17 +122,26 @@ def _check_block_version(heartbeats: "list[Heartbeat]", version: int) -> None:
     typer.echo(f"all workers read blocks of version {version}: edges that send them can start")
 
 
-async def _read_streams(address: ServerAddress) -> "tuple[str, DeadPacks]":
-    """Return a warning if the stream is more than half full of blocks that no checkpoint includes, and packs with dead letters."""
-    from bms_estimator.fleet.nats.dead_packs import DeadPackReader  # noqa: PLC0415 - NATS is optional
+async def _stream_lines(address: ServerAddress) -> list[str]:
+    """Return lines about dead letters and unsaved blocks; a line with the reason if the streams cannot be read."""
+    from nats.errors import Error as NatsError  # noqa: PLC0415 - NATS is optional
+
+    from bms_estimator.fleet.nats.dead_packs import DeadPackReader  # noqa: PLC0415
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.nats.streams import partitions_of  # noqa: PLC0415
     from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks  # noqa: PLC0415
 
     async with connected(*address) as nc:
-        partitions = await partitions_of(nc)
-        warning = (await unsaved_blocks(nc, range(partitions))).warning if partitions is not None else ""
-        return warning, await DeadPackReader(nc).read()
+        try:
+            async with asyncio.timeout(STREAMS_S):
+                partitions = await partitions_of(nc)
+                if partitions is None:
+                    return ["the server has no streams yet: was `fleet serve` started?"]
+                warning = (await unsaved_blocks(nc, range(partitions))).warning
+                return [*_dead_letters(await DeadPackReader(nc).read()), *([warning] if warning else [])]
+        except (TimeoutError, NatsError, UserError) as error:
+            hint = "in a cluster, are most nodes up? Is or was the disk full? Then free space and restart `fleet serve`"
+            return [f"the streams cannot be read ({str(error) or 'no answer'}): {hint}"]
 
 
 async def _receive_heartbeats(address: ServerAddress) -> "list[Heartbeat]":

@@ -10,7 +10,7 @@ import structlog
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.fleet.worker.worker import CHECKPOINT_S, Options, work
 from bms_estimator.model.errors import UserError
@@ -40,8 +40,8 @@ def worker(
     options = Options(server, _worker_name(name), creds, ca, checkpoint_s)
     configure_logs()
     with startup_signals(), flush_logs():
-        with show_compile_progress(structlog.get_logger(__name__).info):
-            load_fleet_kernels()
+        compile_ahead(structlog.get_logger(__name__).info)
+        load_fleet_kernels()
         asyncio.run(_work(options))
 
 

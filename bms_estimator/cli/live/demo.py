@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.page_options import open_browser
 from bms_estimator.demo.demo import run_demo
@@ -60,8 +60,8 @@ def demo(
     """
     log = deque[str](maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)
-    with show_compile_progress():
-        load_kernels()
+    compile_ahead()
+    load_kernels()
     with flush_logs():
         totals = asyncio.run(
             run_demo(

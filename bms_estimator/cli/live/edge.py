@@ -1,4 +1,4 @@
-"""``bms-estimator edge``: sender of a pack's raw samples to a fleet's server.
+"""``bms-estimator edge``: service that only sends the raw samples of a pack to a fleet's server.
 
 The command imports kernels only if decoding the board's frames needs them.
 """
@@ -7,15 +7,102 @@ import asyncio
 from pathlib import Path
 from typing import Annotated
 
+import structlog
 import typer
 
 from bms_estimator.cli.options.pack_options import with_sensor
 from bms_estimator.cli.options.port_options import OtherPort
-from bms_estimator.process.log_setup import configure_logs, flush_logs
-from bms_estimator.process.signals import startup_signals
+from bms_estimator.edge.block_sender import BlockSender
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.process.log_setup import configure_logs, flush_logs, set_level
+from bms_estimator.process.signals import startup_signals, stop_on_signal
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.service.edge_service import serve_edge
-from bms_estimator.settings.pack import load_settings
+from bms_estimator.process.systemd import SystemdNotifier
+from bms_estimator.process.tasks import until_first_ends
+from bms_estimator.settings.pack import Settings, load_settings
+from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.line_source import LineSource
+from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.serial_source import SerialSource
+from bms_estimator.sources.source import Source
+
+SOURCE_HUNG_S = 30.0
+"""Time after which a source whose task has not run counts as hung [s]."""
+MAX_WATCHDOG_S = 5.0
+"""Maximum interval between two watchdog notifications [s]."""
+REPORT_S = 3600.0
+"""Interval between two log lines about the blocks [s]."""
+
+log = structlog.get_logger(__name__)
+
+
+async def serve_edge(
+    settings: Settings, folder: Path, *, stop: asyncio.Event | None = None, notifier: SystemdNotifier | None = None
+) -> None:
+    """Send samples until SIGINT or SIGTERM.
+
+    Args:
+        settings: The pack's settings, with ``[edge]``.
+        folder: Folder of the blocks.
+        stop: Event that ends the service; signals set it, too.
+        notifier: Is notified that the loop is ready and alive.
+
+    Raises:
+        UserError: A setting cannot be used.
+    """
+    if settings.edge is None:
+        raise UserError('edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"')
+    stop, name = stop_on_signal(stop), settings.pack.name
+    notifier = notifier or SystemdNotifier([name], activity="sending samples of")
+    set_level(name, settings.log.level)
+    source = open_line_source(settings) or SerialSource(settings.sensor, board_file=KnownBoardFile(folder, name))
+    with instance_lock(folder, name):
+        async with BlockSender(settings.edge, name, folder) as sender, source:
+            notifier.ready(name)
+            try:
+                await until_first_ends(
+                    _send_samples(source, sender),
+                    _notify_alive(source, sender, notifier, name),
+                    _log_blocks(sender),
+                    stop.wait(),
+                )
+            finally:
+                notifier.stopping(name)
+
+
+async def _send_samples(source: Source, sender: BlockSender) -> None:
+    """Pass all samples of the source to the block sender."""
+    async for received in source:
+        sender.take(received.samples, received.cells_v)
+        await asyncio.sleep(0)  # a source that always has samples must not starve the sender
+
+
+async def _notify_alive(
+    source: SerialSource | LineSource, sender: BlockSender, notifier: SystemdNotifier, name: str
+) -> None:
+    """Notify the watchdog while the source's task runs, and report the status."""
+    sent_status = ""
+    while True:
+        if source.health().task_idle_s <= SOURCE_HUNG_S:
+            notifier.alive(name)
+        status = (
+            f"no samples: {source.silence_reason}"
+            if source.silence_reason
+            else f"{sender.store.waiting} blocks not sent"
+        )
+        if status != sent_status:
+            notifier.status(name, status)
+            sent_status = status
+        # three notifications within the watchdog's timeout; 0: no watchdog
+        await asyncio.sleep(min(MAX_WATCHDOG_S, notifier.watchdog_s / 3.0 or MAX_WATCHDOG_S))
+
+
+async def _log_blocks(sender: BlockSender) -> None:
+    """Log the state of the blocks at intervals."""
+    while True:
+        await asyncio.sleep(REPORT_S)
+        log.info("blocks of samples", **sender.health().model_dump())
 
 
 def edge(

@@ -25,7 +25,7 @@ from bms_estimator.cli.options.capture_options import (
     check_output_file,
     complete_battery,
 )
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
 from bms_estimator.forecast.forecast import Forecast, ForecastCurve
@@ -41,7 +41,7 @@ from bms_estimator.service.forecast_request import as_json_data
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import open_capture
 from bms_estimator.sources.captures.trip_file import read_trip
-from bms_estimator.telemetry.cutoff_text import CUTOFF_FIELDS, cutoff_text
+from bms_estimator.telemetry.state import CUTOFF_FIELDS, cutoff_text
 
 PLOT_FORMATS = (".png", ".svg", ".pdf")
 """Allowed extensions of the plot file."""
@@ -127,20 +127,18 @@ def forecast(
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if cutoff_v is not None:
         settings = with_pack(settings, cutoff_v=cutoff_v)
-    with show_compile_progress():
-        if capture is not None:
-            start = _end_of_capture(settings, model, capture, current_sign, column_map, has_pack=pack is not None)
-        else:
-            start = StateFiles(state_folder(settings), settings, model).saved_pack()
-        if start.load_reason:
-            typer.echo(f"warning: the observed load is unknown: {start.load_reason}", err=True)
-        forecaster = start.pack.forecaster
-        if forecaster is None:
-            raise UserError(
-                f"{model.cell.name}: a forecast needs a battery, and identifier.enabled = true in the settings"
-            )
-        result = forecaster.forecast(trip.load if trip else None)
-        curve = forecaster.trip_curve(trip.load) if trip and trip.has_end else None
+    compile_ahead()
+    if capture is not None:
+        start = _end_of_capture(settings, model, capture, current_sign, column_map, has_pack=pack is not None)
+    else:
+        start = StateFiles(state_folder(settings), settings, model).saved_pack()
+    if start.load_reason:
+        typer.echo(f"warning: the observed load is unknown: {start.load_reason}", err=True)
+    forecaster = start.pack.forecaster
+    if forecaster is None:
+        raise UserError(f"{model.cell.name}: a forecast needs a battery, and identifier.enabled = true in the settings")
+    result = forecaster.forecast(trip.load if trip else None)
+    curve = forecaster.trip_curve(trip.load) if trip and trip.has_end else None
     outcome = trip_outcome(trip, curve) if trip and curve else None
     if plot is not None:
         _write_plot(plot, start.name, curve or result.curve, forecaster.cutoff_v)

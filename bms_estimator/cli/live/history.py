@@ -17,8 +17,8 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.pack import load_settings
+from bms_estimator.store.history import MINUTE_S, Minute
 from bms_estimator.store.history_reader import HistoryReader, PastEvent
-from bms_estimator.store.minute import MINUTE_S, Minute
 
 TIME_EXAMPLE = "2026-01-31 or 2026-01-31T12:00"
 """Example of a start time in help texts."""

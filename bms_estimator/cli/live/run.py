@@ -12,7 +12,7 @@ from typing import Annotated
 import structlog
 import typer
 
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
 from bms_estimator.cli.options.port_options import OtherPort
 from bms_estimator.model.errors import UserError
@@ -94,5 +94,5 @@ def _run_one(settings: Settings, model: PackModel, record: Path | None, *, view:
 
 
 def _load_kernels() -> None:
-    with show_compile_progress(structlog.get_logger(__name__).info):
-        load_kernels()
+    compile_ahead(structlog.get_logger(__name__).info)
+    load_kernels()

@@ -140,7 +140,16 @@ def simulate(
         # ``with_broker`` sets mqtt; the default only satisfies the type checker
         broker = with_broker(Settings(), mqtt).mqtt or MqttSettings()
         cells = model.cell.series_count
-        device = SimulatedNode(pack, cells=cells, mqtt=broker, prefix=prefix, speed=speed, seed=seed)
+        device = SimulatedNode(
+            pack,
+            cells=cells,
+            mqtt=broker,
+            prefix=prefix,
+            speed=speed,
+            seed=seed,
+            soc=lambda: pack.soc,
+            capacity_ah=model.cell.capacity_ah,
+        )
     elif protocol is None:
         mode = "text" if text else "binary"
         device = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)

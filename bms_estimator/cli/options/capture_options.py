@@ -9,9 +9,9 @@ import typer
 
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.model.cell import CellModel, battery_names, cell_names, fitted_to, with_name
-from bms_estimator.model.cell_file import write_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.pack_model import write_cell
 from bms_estimator.model.sample import CurrentSign, capture_digest
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map

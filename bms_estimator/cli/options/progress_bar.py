@@ -7,18 +7,18 @@ from numba.core import event
 from rich.console import Console
 from rich.progress import Progress
 
-from bms_estimator.cli.options.compile_progress import COMPILE_TEXT, CompileListener, new_bar
+from bms_estimator.cli.options.compile_progress import COMPILE_TEXT, new_bar
 
 MIN_CHANGE = 0.001
 """Minimum change of the fraction that is drawn. A calculation may report its progress more often."""
 
 
-class ProgressBar:
+class ProgressBar(event.Listener):
     """Bar that is drawn while the context of ``progress_bar`` lasts."""
 
     def __init__(self, label: str, bar: Progress) -> None:
         self._bar, self._task = bar, bar.add_task(label, total=1.0)
-        self._drawn, self._label = 0.0, label
+        self._drawn, self._label, self._has_compiled = 0.0, label, False
 
     def update(self, fraction: float, label: str | None = None) -> None:
         """Draw the finished fraction, 0..1, and another label if one is given."""
@@ -27,9 +27,14 @@ class ProgressBar:
             self._drawn, self._label = fraction, label
             self._bar.update(self._task, completed=fraction, description=label)
 
-    def show_compilation(self) -> None:
-        """Print above the bar that kernels compile. The time left does not include the compilation."""
-        self._bar.console.print(COMPILE_TEXT)
+    def on_start(self, _: event.Event) -> None:
+        """Print above the bar, once, that kernels compile. The time left does not include the compilation."""
+        if not self._has_compiled:
+            self._has_compiled = True
+            self._bar.console.print(COMPILE_TEXT)
+
+    def on_end(self, _: event.Event) -> None:
+        """Do nothing: the end of a compilation is not needed."""
 
 
 @contextmanager
@@ -45,5 +50,5 @@ def progress_bar(label: str) -> Iterator[ProgressBar]:
         if not console.is_terminal:
             yield bar
             return
-        with event.install_listener("numba:compile", CompileListener(bar.show_compilation)):
+        with event.install_listener("numba:compile", bar):
             yield bar

@@ -1,11 +1,24 @@
-"""Output of commands: a table, a number with its noun, and the status line of a command that waits."""
+"""Output of commands: a table, a number with its noun, the status line of a command that waits, and a silenced log."""
 
-from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
+import structlog
 from rich import box
 from rich.console import Console
 from rich.table import Table
+
+
+@contextmanager
+def silenced_log() -> Iterator[None]:
+    """Silence the log within the context."""
+    previous_config = structlog.get_config()
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    try:
+        yield
+    finally:
+        structlog.configure(**previous_config)
 
 
 def show_status(text: str) -> AbstractContextManager[object]:

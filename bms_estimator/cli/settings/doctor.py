@@ -15,9 +15,9 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.capture_options import AsJson
-from bms_estimator.cli.options.compile_progress import show_compile_progress
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.cli.options.silenced_log import silenced_log
+from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.doctor.device_check import load_decoder
 from bms_estimator.doctor.examine import examine
 from bms_estimator.doctor.finding import Finding, Level, fault
@@ -75,7 +75,7 @@ def _examine(path: Path) -> Iterator[Finding]:
         yield subject
         yield from examine(None)
     else:
-        with show_compile_progress():
+        with progress_bar("loading the decoder"):
             load_decoder(subject)
         yield from examine(subject)
 

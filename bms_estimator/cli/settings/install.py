@@ -10,11 +10,10 @@ from typing import Annotated
 import typer
 
 from bms_estimator.installation import places
-from bms_estimator.installation.install import PackFiles, install, restart_running, start
+from bms_estimator.installation.install import PackFiles, install, restart_running, start, uninstall
 from bms_estimator.installation.machine import Machine
 from bms_estimator.installation.pack_files import is_hidden, named_files
 from bms_estimator.installation.program_copy import copy_program, is_program_copy, system_python
-from bms_estimator.installation.uninstall import uninstall
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.version import __version__

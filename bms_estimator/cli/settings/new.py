@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.compile_progress import show_compile_progress
+from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.table import show_status
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
@@ -26,6 +26,7 @@ from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack_file import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.first_estimate import estimate_text, load_note, run_estimator
 from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.measurement import Measurement, measure
@@ -43,7 +44,7 @@ def new(
         list[str] | None,
         typer.Option(
             "--search",
-            help="where to search: path of a serial port, URL of an MQTT broker, host name of a Modbus device, or bluetooth; may be repeated; default: all USB serial ports, the MQTT broker on this machine, Bluetooth",
+            help="where to search: path of a serial port, URL of an MQTT broker (mqtt://user:password@host), host name of a Modbus device, or bluetooth; may be repeated; default: all USB serial ports, the MQTT broker on this machine, Bluetooth",
             show_default=False,
         ),
     ] = None,
@@ -81,7 +82,8 @@ def new(
     parallel: Annotated[str | None, typer.Option(help=QUESTIONS[4].help, show_default=False)] = None,
     max_discharge_a: Annotated[str | None, typer.Option(help=QUESTIONS[5].help, show_default=False)] = None,
     max_charge_a: Annotated[str | None, typer.Option(help=QUESTIONS[6].help, show_default=False)] = None,
-    broker: Annotated[str | None, typer.Option(help=QUESTIONS[7].help, show_default=False)] = None,
+    device_soc_std: Annotated[str | None, typer.Option(help=QUESTIONS[7].help, show_default=False)] = None,
+    broker: Annotated[str | None, typer.Option(help=QUESTIONS[8].help, show_default=False)] = None,
     estimate: Annotated[
         bool, typer.Option("--estimate/--no-estimate", help="run the estimator for some seconds, and show the SOC")
     ] = True,
@@ -103,22 +105,23 @@ def new(
     with _reported_interruption(file):
         prompts = Prompts(yes=yes)
         result = _search(search_at or ([device] if device and device.startswith("/") else _default_places()))
+        result = _log_in(prompts, result)
         answers = _choose_device(prompts, result, device)
         measured = _measure(answers.device)
         options = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
         sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
-        voltage_v = measured.voltage_v if measured else None
-        answers = replace(answers, voltage_v=voltage_v, name=file.stem, sensor=sensor)
-        given = (name, cell, capacity_ah, series, parallel, max_discharge_a, max_charge_a, broker)
+        answers = replace(answers, measured=measured, name=file.stem, sensor=sensor)
+        given = (name, cell, capacity_ah, series, parallel, max_discharge_a, max_charge_a, device_soc_std, broker)
         for question, option in zip(QUESTIONS, given, strict=True):
-            answers = _ask(prompts, question, option, answers)
+            if option is not None or question.is_asked(answers):
+                answers = _ask(prompts, question, option, answers)
         pack = create_pack(file, answers)
         for warning in pack.warnings:
             typer.echo(f"warning: {warning}", err=True)
         typer.echo(f"{file}: written; {pack.summary}")
         if estimate and measured:
-            with show_compile_progress():
-                load_kernels()
+            compile_ahead()
+            load_kernels()
             asyncio.run(run_estimator(pack.settings, pack.cell, _print_estimate, seconds=ESTIMATE_S))
             if note := load_note(measured.current_a, pack.cell.cell.capacity_ah):
                 typer.echo(note)
@@ -176,8 +179,24 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
             return Answers(chosen, found_broker=result.broker)
-        later = _search([chosen], result.devices)
+        later = _log_in(prompts, _search([chosen], result.devices))
         result = replace(later, broker=later.broker or result.broker)
+
+
+def _log_in(prompts: Prompts, result: SearchResult) -> SearchResult:
+    """Ask for user name and password of each broker that requires them, and search it again until they are right or empty."""
+    while result.closed and prompts.is_interactive:
+        login, *others = result.closed
+        username = str(
+            typer.prompt(f"User name at {login.url} (empty: skip this broker)", default="", show_default=False)
+        )
+        if not username:
+            result = replace(result, closed=others)
+            continue
+        password = str(typer.prompt("Password", hide_input=True))
+        later = _search([BrokerLogin(login.url, username, password).address], result.devices)
+        result = replace(later, broker=later.broker or result.broker, closed=later.closed + others)
+    return result
 
 
 def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> FoundDevice | str:

@@ -24,13 +24,13 @@ from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, assemble
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.settings.alarm_limits import AlarmDefinition, min_charge_current_a, monitored_alarms, short_limit_a
-from bms_estimator.settings.charge_limits import NO_LIMITS
 from bms_estimator.settings.pack import PackSettings, Settings
+from bms_estimator.settings.sampling import NO_LIMITS
 from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS
 from bms_estimator.telemetry.alarms.evaluator import SENSOR_SUSPECTS
 from bms_estimator.telemetry.alarms.inputs import QUANTITIES
-from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.impossible import PackBounds
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
 
 MAX_TYPES = 256
 """Maximum number of cached types. Creating a type that is not cached takes 50 ms."""

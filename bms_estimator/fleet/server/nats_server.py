@@ -6,6 +6,7 @@ The child ends with this process, even if this process is killed. After a failur
 import asyncio
 import contextlib
 import functools
+import shutil
 import signal
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import replace
@@ -18,8 +19,8 @@ from bms_estimator.fleet.nats.streams import NoAnswerError
 from bms_estimator.fleet.server.disk_space import available_bytes
 from bms_estimator.fleet.server.local_client import scheme
 from bms_estimator.fleet.server.metrics_endpoint import metrics_endpoint
-from bms_estimator.fleet.server.monitor import POLL_S, is_healthy, wait_for_monitor
-from bms_estimator.fleet.server.nats_config import configuration
+from bms_estimator.fleet.server.monitor import POLL_S, is_healthy, query_monitor, wait_for_monitor
+from bms_estimator.fleet.server.nats_config import Node, configuration
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check_node_disk, check_tls_files, node_of
 from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
@@ -35,12 +36,18 @@ RELOAD_TIMEOUT_S = 60.0
 FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
 """Signals that are forwarded to the server. SIGUSR2 starts its lame duck mode, in which it disconnects its clients
 gradually, so that they move to other nodes, and then ends."""
+HEALTH_S = 10.0
+"""Poll interval for the health of the streams [s]."""
+MIN_FREE_FRACTION = 0.05
+"""Free fraction of the disk from which on a server is restarted whose disk was full, as in the alert ``FleetDiskFull``."""
 CONFIGURATION = "nats-server.conf"
 """Name of the server's configuration file."""
 
 
 async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Callable[[str], None]) -> int:
     """Run a node until it ends. SIGHUP reloads its settings: tenants, limits, revoked users.
+
+    nats-server stores nothing after its disk was full, and is restarted as soon as space is free.
 
     Args:
         place: Location of this node.
@@ -53,6 +60,15 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
     Raises:
         UserError: The server is missing or too old, settings are invalid, the disk is too small, or the server rejects the streams.
     """
+    while (code := await _serve_until_restart(place, read, report)) is None:
+        log.warning("restarting nats-server, because the disk that was full has free space")
+    return code
+
+
+async def _serve_until_restart(
+    place: NodeLocation, read: Callable[[], ServerSpec], report: Callable[[str], None]
+) -> int | None:
+    """Run a nats-server. Arguments, result and errors are those of ``serve``; None: the server must be restarted."""
     binary, spec = find_server(), read()
     place = replace(place, available_bytes=available_bytes(place.streams))
     check_node_disk(place, spec)
@@ -69,16 +85,39 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
         ended = asyncio.create_task(process.wait())
         streams_ready = asyncio.create_task(_make_ready(place, spec, process.pid, report))
         supervising = asyncio.create_task(_supervise(place, spec, read, process, streams_ready, report, watch))
+        needs_restart = asyncio.create_task(_until_disk_has_space_again(place, node))
         try:
             await asyncio.wait((ended, streams_ready), return_when=asyncio.FIRST_COMPLETED)
             if streams_ready.done() and not ended.done():
                 streams_ready.result()
+            await asyncio.wait((ended, needs_restart), return_when=asyncio.FIRST_COMPLETED)
+            if not ended.done():
+                process.terminate()
             code = await ended
+            is_restart = needs_restart.done() and not end_requested.is_set()
         finally:
-            streams_ready.cancel()
-            supervising.cancel()
-            await asyncio.gather(streams_ready, supervising, return_exceptions=True)
+            tasks = (streams_ready, supervising, needs_restart)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        if is_restart:
+            return None
         return 0 if end_requested.is_set() else code
+
+
+async def _until_disk_has_space_again(place: NodeLocation, node: Node) -> None:
+    """Wait until a stream could not be written, because the disk was full, and space is free."""
+    last_error = ""
+    while True:
+        await asyncio.sleep(HEALTH_S)
+        error = str((await query_monitor(node, "healthz")).get("error", ""))
+        if "no space" not in error:
+            continue
+        if error != last_error:
+            log.error("the disk is full: nothing is stored until space is free", reason=error)
+        last_error, disk = error, shutil.disk_usage(place.folder)
+        if disk.free > MIN_FREE_FRACTION * disk.total:
+            return
 
 
 async def _supervise(

@@ -37,7 +37,7 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.telemetry.cells import make_cells_payload
-from bms_estimator.telemetry.charge_energy import ChargeEnergy
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.state import make_state_payload

@@ -29,11 +29,13 @@ class PeriodicStorage:
 
     Attributes:
         checkpoint_s: Duration of the last written checkpoint [s]; None before the first.
+        troubles: Errors of the last attempts to store something, by partition.
     """
 
     def __init__(self, nc: Client, interval_s: float, partitions: int) -> None:
         self._nc, self._interval_s, self._partitions = nc, interval_s, partitions
         self.checkpoint_s: float | None = None
+        self.troubles: dict[int, str] = {}
 
     def first_due_s(self, number: int, now_s: float) -> float:
         """Return the time of a partition's first checkpoint. The checkpoints of the partitions are spread over the interval."""
@@ -57,14 +59,13 @@ class PeriodicStorage:
 
     async def _try(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
         """Run ``action``. After an error of connection or server, the next periodic call tries again."""
+        self.troubles.pop(lease.number, None)
         try:
             await action()
         except RETRYABLE_ERRORS as error:
-            log.warning(
-                "a checkpoint, summary or dead letter could not be stored; trying again",
-                partition=lease.number,
-                reason=error_text(error),
-            )
+            event, reason = "a checkpoint, summary or dead letter could not be stored; trying again", error_text(error)
+            log.warning(event, partition=lease.number, reason=reason)
+            self.troubles[lease.number] = f"{event}: {reason}"
 
 
 class UnsavedCheck:
@@ -87,10 +88,9 @@ class UnsavedCheck:
         try:
             warning = (await unsaved_blocks(self._nc, partitions)).warning
         except RETRYABLE_ERRORS as error:
-            log.warning("the stream cannot be checked", reason=error_text(error))
-            return
+            warning = f"the streams cannot be read: {error_text(error)}"
         if warning and not self.warning:
-            log.warning("the stream fills with blocks that no checkpoint includes", reason=warning)
+            log.warning("blocks may be lost that no checkpoint includes", reason=warning)
         self.warning = warning
 
 

@@ -317,7 +317,8 @@ class Worker:
             leaving=self._leaving,
             reconnects=self._nc.stats["reconnects"],
             checkpoint_s=self._storage.checkpoint_s,
-            trouble=lease_trouble or self._bucket.fault or self._unsaved.warning,
+            trouble=lease_trouble
+            or next(iter(self._storage.troubles.values()), self._bucket.fault or self._unsaved.warning),
         )
 
 

@@ -260,11 +260,35 @@ def apply_anchor(f: Record, ekf: Record, soc: float, std: float) -> None:
     else:
         for q in range(f.count):
             update_by_anchor(f, q, soc, variance)
-        for q in range(f.count):
-            if f.ln_weight[q] > f.ln_weight[f.best]:
-                f.best = q
-        prune_and_merge(f)
+        choose_best(f)
     mixture_moments(f)
+
+
+@njit(cache=True)
+def apply_prior(f: Record, soc: float, std: float) -> None:
+    """Correct the filter by the SOC that a device reports, with ``std``.
+
+    A hypothesis that differs by more than ``MAX_STDS`` only loses weight, as if it differed by ``MAX_STDS``, because the device
+    may be wrong. Later voltages decide.
+    """
+    variance = std * std
+    for q in range(f.count):
+        total, difference = f.covariance[q, SOC, SOC] + variance, soc - f.mean[q, SOC]
+        if difference * difference > MAX_STDS**2 * total:
+            f.ln_weight[q] -= 0.5 * (MAX_STDS**2 + math.log(total))
+        else:
+            update_by_anchor(f, q, soc, variance)
+    choose_best(f)
+    mixture_moments(f)
+
+
+@njit(cache=True)
+def choose_best(f: Record) -> None:
+    """Choose the likeliest hypothesis again after a correction of the weights, and merge and remove hypotheses."""
+    for q in range(f.count):
+        if f.ln_weight[q] > f.ln_weight[f.best]:
+            f.best = q
+    prune_and_merge(f)
 
 
 @njit(cache=True)

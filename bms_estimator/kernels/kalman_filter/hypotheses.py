@@ -93,6 +93,8 @@ INCONSISTENT_STDS = 2.0
 that its innovations alone are small."""
 REINITIALIZED_STD = 0.2
 """Std of the SOC after a re-initialization, equal to the default at switch-on."""
+PROBIT = 1.702
+"""Factor with which the logistic function of a deviation in std approximates its normal probability within 0.01."""
 MIN_PROBABILITY = 1e-12
 """Minimum prior probability of a hypothesis, so that its logarithm is finite."""
 EXCHANGE_STDS = 3.0
@@ -195,27 +197,27 @@ def begin_search(s: Record) -> None:
 
 @njit(cache=True)
 def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
-    """Initialize hypotheses after a gap: usual use in the gap, or any SOC.
+    """Initialize hypotheses after a gap: usual use in the gap, a rest, or any SOC.
 
     In the gap the pack may have been charged, discharged or exchanged, with a prior probability that grows with ``gap_s``
     [s]. Hypotheses with the same estimates of sensor and cell therefore cover SOC 0 to 1 evenly. One hypothesis remains
-    beside them: the usual load if its std is at most ``MAX_KEPT_STD``, or else a rest that continued. If the voltage cannot
-    distinguish them, the remaining one stays likely. The weights of the others contain the remaining
+    beside them: the usual load if its std is at most ``MAX_KEPT_STD``, or else a rest if it is likelier than one of the others.
+    If the voltage cannot distinguish them, the remaining one stays likely. The weights of the others contain the remaining
     probability of the usual load.
 
     Args:
-        s: Record of EKF_STATE; hypothesis 0 was propagated with the usual load, and hypothesis 1 with a rest if ``rested``.
+        s: Record of EKF_STATE; hypothesis 0 was propagated with the usual load, and hypothesis 1 with a rest.
         p: Record of EKF_SETTINGS.
-        gap_s: Duration of the gap [s].
+        gap_s: Duration of the gap [s]; infinite if unknown.
         rested: True if the pack rested before the gap.
     """
     soc, std = s.mean[0, SOC], math.sqrt(s.covariance[0, SOC, SOC])
     event = p.event_probability * (1.0 - math.exp(-gap_s / p.event_s))
-    kept, kept_probability = -1, 0.0
-    if std <= MAX_KEPT_STD:
-        kept, kept_probability = 0, 1.0 - event
-    elif rested:
-        kept, kept_probability = 1, (1.0 - event) * math.exp(-gap_s / USUAL_S)
+    kept, kept_probability = 0, 1.0 - event
+    if std > MAX_KEPT_STD:
+        kept, kept_probability = 1, (1.0 - event) * rest_probability(soc, std, gap_s, rested)
+    if kept_probability < event / HYPOTHESES:
+        kept, kept_probability = -1, 0.0
     even = HYPOTHESES if kept < 0 else HYPOTHESES - 1
     spacing = 1.0 / (even - 1)
     row = HYPOTHESES  # index of the remaining hypothesis, in the order of SOC; HYPOTHESES: none remains
@@ -242,6 +244,19 @@ def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
         s.ln_weight[row] = math.log(max(kept_probability, MIN_PROBABILITY))
     s.count, s.best = HYPOTHESES, np.argmax(s.ln_weight)
     begin_search(s)
+
+
+@njit(cache=True)
+def rest_probability(soc: float, std: float, gap_s: float, rested: bool) -> float:
+    """Return the probability of a rest in a gap without a charge or an exchange.
+
+    A rest continues with the time constant ``USUAL_S``. A load cannot continue in an empty pack, nor a charge in a full one.
+    Therefore the probability of an SOC beyond 0 and 1 by the usual load, with mean ``soc`` and ``std``, is that of a rest.
+    """
+    if gap_s == math.inf:
+        return 0.0
+    beyond = 1.0 / (1.0 + math.exp(PROBIT * soc / std)) + 1.0 / (1.0 + math.exp(PROBIT * (1.0 - soc) / std))
+    return max(beyond, math.exp(-gap_s / USUAL_S) if rested else 0.0)
 
 
 @njit(cache=True)
@@ -298,21 +313,13 @@ def update_hypotheses(s: Record, p: Record) -> None:
             end_learning(s, p)
     s.soc_before -= w.charge_as / p.capacity_as  # for its comparison with the present SOC in detect_exchange
     variance_v2 = measurement_variance(s, p, dt_s, w.samples) + skew_variance(s, p)
-    scale, best = innovation_scale(s, p), 0
+    best = 0
     for q in range(s.count):
         if dt_s > 0.0:
             predict(s, p, q)
         innovation_v, total_v2, linear_v2 = update(s, p, q, variance_v2)
         u = innovation_v / math.sqrt(total_v2)
-        # S excludes the linearization error, because that error is constant at rest: repeated each second, it would reject
-        # an SOC at a knee of the OCV
-        s.ln_weight[q] -= p.half_likelihood_exponent * (
-            innovation_v * innovation_v / (scale * linear_v2) + math.log(linear_v2)
-        )
-        if s.count > 1:
-            s.ln_weight[q] -= p.inconsistency_penalty * max(
-                normalized_bias_squared(s, p, q) - INCONSISTENT_STDS**2, 0.0
-            )
+        update_weight(s, p, q, innovation_v, linear_v2, variance_v2)
         if dt_s > 0.0 and not w.gap:  # a single innovation after a long gap does not show a persistent error
             adapt_bias_inflation(s, q, dt_s, u)
         if q == 0 or s.ln_weight[q] > s.ln_weight[best]:
@@ -326,6 +333,52 @@ def update_hypotheses(s: Record, p: Record) -> None:
     reinitialize_if_biased(s, p)
     detect_exchange(s)
     reset_window(s)
+
+
+@njit(cache=True)
+def update_weight(s: Record, p: Record, q: int, innovation_v: float, linear_v2: float, variance_v2: float) -> None:
+    """Update the log-weight of hypothesis ``q``.
+
+    S excludes the linearization error, because that error is constant at rest: repeated each second, it would reject an SOC at a
+    knee of the OCV.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        q: Index of the hypothesis.
+        innovation_v: Innovation [V].
+        linear_v2: S without the linearization error [V^2].
+        variance_v2: R [V^2].
+    """
+    scale = innovation_scale(s, p)
+    if s.window.time_s > 0.0 and not s.window.gap:
+        linear_v2 = repeated_variance(s, p, innovation_v * innovation_v / scale, linear_v2, variance_v2)
+    s.ln_weight[q] -= p.half_likelihood_exponent * (
+        innovation_v * innovation_v / (scale * linear_v2) + math.log(linear_v2)
+    )
+    if s.count > 1:
+        s.ln_weight[q] -= p.inconsistency_penalty * max(normalized_bias_squared(s, p, q) - INCONSISTENT_STDS**2, 0.0)
+
+
+@njit(cache=True)
+def repeated_variance(s: Record, p: Record, likeliest_v2: float, linear_v2: float, variance_v2: float) -> float:
+    """Return the innovation variance for the weight of a hypothesis after the first update, between R and S [V^2].
+
+    S contains errors that persist from update to update, as that of the curve at a knee. Repeated each second, the term ln S would
+    reject a true SOC at the end of a plateau although it predicts each voltage. Therefore the variance that makes the innovation
+    likeliest replaces S. Outside the temperature range of the cell file S remains, because innovations are not smaller there.
+
+    Args:
+        s: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        likeliest_v2: Variance that makes the innovation likeliest [V^2].
+        linear_v2: S without the linearization error [V^2].
+        variance_v2: R [V^2].
+    """
+    likeliest_v2 = min(linear_v2, max(variance_v2, likeliest_v2))
+    usual = p.min_innovation_scale
+    share = (usual * extrapolation_factor(p, s.temperature_c) ** 2 - usual) / (1.0 - usual)
+    return likeliest_v2 * (linear_v2 / likeliest_v2) ** min(share, 1.0)
 
 
 @njit(cache=True)

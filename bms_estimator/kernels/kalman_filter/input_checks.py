@@ -20,7 +20,8 @@ from bms_estimator.kernels.kalman_filter.frozen_sensor import (
 )
 from bms_estimator.kernels.kalman_filter.gap_charge import initialize_load_statistics
 from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, spawn_hypotheses
-from bms_estimator.kernels.kalman_filter.records import B_SLOW, HYPOTHESES, LN_Q, OFFSET, STATES
+from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION, node_error_scale
+from bms_estimator.kernels.kalman_filter.records import B_SLOW, HYPOTHESES, LN_Q, NODE, NODES, OFFSET, STATES
 from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
 from bms_estimator.kernels.kalman_filter.window import reset_window
 from bms_estimator.model.arrays import Record
@@ -67,6 +68,9 @@ CLEAR_FRACTION = 0.7
 """Fraction of its limit below which a fault ends (hysteresis)."""
 MAX_OCV_BIAS_V = 0.12
 """Mean bias of one cell above which the OCV counts as wrong [V]. An OCV of the cell's chemistry has smaller errors."""
+MAX_LEVEL_V = 0.03
+"""Difference between the level of a plateau and that of the curve, of one cell, above which the voltage counts as wrong [V]. Makes of
+LFP differ by 11 mV."""
 OCV_BIAS_S = 1800.0
 """Averaging time of the mean bias that shows a wrong OCV [s]."""
 REINITIALIZATIONS_S = 5.0 * 3600.0
@@ -76,7 +80,7 @@ MAX_REINITIALIZATIONS = 4.0
 TEMPERATURE_MARGIN_K = 5.0
 """Distance from the temperature range of the cell file for the fault TEMPERATURE [K]."""
 
-SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT, PACK = (
+SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT, PACK, LEVEL = (
     int(bit) for bit in InputFault
 )
 UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT
@@ -106,6 +110,7 @@ CHECKS = np.dtype(
         ("held_soc", "f8"),  # SOC at the last change of the voltage
         ("held_soc_std", "f8"),  # std of the SOC at the last change of the voltage
         ("same_s", "f8"),  # time since the last change of the current [s]
+        ("noise_v", "f8"),  # mean change of the voltage between two samples while the current is constant [V]
         ("same_soc", "f8"),  # SOC at the last change of the current
         ("same_soc_std", "f8"),  # std of the SOC at the last change of the current
         ("wrong_v", "f8"),  # running mean of the slow bias [V]
@@ -341,7 +346,25 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
         bits |= TEMPERATURE
     if f.exchanged:
         bits |= PACK
-    c.suspects = bits
+    c.suspects = bits | plateau_level_bit(f, p, before)
+
+
+@njit(cache=True)
+def plateau_level_bit(f: Record, p: Record, before: int) -> int:
+    """Return the bit of the fault LEVEL. After the filter has learned the level in the first pass, the fault remains.
+
+    Args:
+        f: Record of EKF_STATE.
+        p: Record of EKF_SETTINGS.
+        before: Bits of the faults before this update.
+    """
+    if p.node_correlation == NODE_CORRELATION or f.learned_soc >= p.learning_soc:  # no plateau, or nodes at their prior
+        return before & LEVEL
+    middle = NODES // 2
+    scale_v = node_error_scale(p, 0.5, 0.0)
+    level_v = scale_v * f.mean[f.best, NODE + middle]
+    variance_v2 = scale_v * scale_v * f.covariance[f.best, NODE + middle, NODE + middle]
+    return LEVEL if is_significant_bias(level_v, variance_v2, MAX_LEVEL_V * p.series, before & LEVEL) else 0
 
 
 @njit(cache=True)

@@ -43,7 +43,8 @@ class Estimate(Payload):
         float | None, Quantity(raw_entity("Highest cell, voltage", "V", 3, "voltage"), packs="with cell voltages")
     ] = Field(description="highest cell voltage at the last sample [V]; null without cell voltages")
     cell_lowest: Annotated[
-        int | None, Quantity(Entity("Lowest cell", None, 0, 1.0, state_class=None), packs="with cell voltages")
+        int | None,
+        Quantity(Entity("Lowest cell", None, 0, 1.0, state_class=None, icon="numeric"), packs="with cell voltages"),
     ] = Field(description="number of the lowest cell, from 1")
     cell_highest: Annotated[
         int | None,
@@ -71,6 +72,22 @@ class Estimate(Payload):
         description="true if soc_std was below 0.12 and has not risen above 0.15 since, and always without the identifier; false: "
         "soc is not shown, and no alarm uses it"
     )
+    device_soc: Annotated[
+        float | None,
+        Quantity(
+            Entity("State of charge by the BMS", "%", 1, 1.0, icon="battery-outline", factor=100.0),
+            packs="batteries",
+            prometheus="ratio",
+        ),
+    ] = Field(description="state of charge by the device (BMS, battery monitor), 0..1; null if it reports none")
+    device_soc_difference: Annotated[
+        float | None,
+        Quantity(
+            raw_entity("State of charge, difference to the BMS", "%", 1)._replace(factor=100.0),
+            packs="batteries",
+            prometheus="ratio",
+        ),
+    ] = Field(description="soc minus device_soc; null if one of them is not known")
     soc_coulomb: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         description="state of charge by coulomb counting alone, 0..1"
     )
@@ -78,7 +95,8 @@ class Estimate(Payload):
         description="state of charge by the inverted OCV (7.1), 0..1; null if the last sample had no new voltage"
     )
     remaining_capacity_ah: Annotated[
-        float | None, Quantity(Entity("Remaining capacity", "Ah", 2, 0.02, is_primary=True), packs="batteries")
+        float | None,
+        Quantity(Entity("Remaining charge", "Ah", 2, 0.02, is_primary=True, icon="battery-medium"), packs="batteries"),
     ] = Field(description="remaining charge to SOC 0 [Ah]")
     remaining_energy_wh: Annotated[
         float | None,
@@ -104,7 +122,7 @@ class Estimate(Payload):
     )
     time_to_full_s: float | None = Field(description="time until the charger ends the charge [s]; null unless charging")
     usable_capacity_ah: Annotated[
-        float | None, Quantity(Entity("Usable capacity", "Ah", 2, 0.02, is_primary=True), packs="batteries")
+        float | None, Quantity(raw_entity("Usable charge at this load", "Ah", 2), packs="batteries")
     ] = Field(description="remaining charge to the cut-off voltage at the present load and temperature [Ah]")
     available_discharge_power_10s_w: Annotated[
         float | None,
@@ -124,7 +142,12 @@ class Estimate(Payload):
         description="reason why time_to_cutoff_s and its quantiles are null; null if they have values"
     )
     weakest_cell_soc: Annotated[
-        float | None, Quantity(Entity("Weakest cell, SOC", None, 3, 0.01), packs="batteries", prometheus="ratio")
+        float | None,
+        Quantity(
+            Entity("Weakest cell, state of charge", "%", 1, 1.0, icon="battery-low", factor=100.0),
+            packs="batteries",
+            prometheus="ratio",
+        ),
     ] = Field(
         description="SOC of the weakest cell, 0..1: by the cell voltages, or without them by the voltage of the bank; null for a single cell, "
         "and before the first comparison",
@@ -134,22 +157,32 @@ class Estimate(Payload):
     )
     weakest_cell_capacity: Annotated[
         float | None,
-        Quantity(Entity("Weakest cell, capacity", None, 2, 0.01), packs="batteries", prometheus="ratio"),
+        Quantity(
+            raw_entity("Weakest cell, capacity of the others", "%", 0)._replace(factor=100.0),
+            packs="batteries",
+            prometheus="ratio",
+        ),
     ] = Field(description="capacity of the weakest cell relative to the other cells")
     usable_capacity_to_weakest_ah: Annotated[
         float | None, Quantity(raw_entity("Usable capacity to the weakest cell", "Ah", 2), packs="batteries")
     ] = Field(description="remaining charge until the weakest cell is empty [Ah]")
     weakest_cell: Annotated[
-        int | None, Quantity(Entity("Weakest cell", None, 0, 1.0, state_class=None), packs="with cell voltages")
+        int | None,
+        Quantity(Entity("Weakest cell", None, 0, 1.0, state_class=None, icon="numeric"), packs="with cell voltages"),
     ] = Field(
         description="number of the cell with the lowest SOC, from 1; null before the first estimate of the cells, and "
         "without cell voltages",
     )
     cell_soc_spread: Annotated[
-        float | None, Quantity(Entity("Cell spread, SOC", None, 3, 0.005), packs="with cell voltages")
+        float | None,
+        Quantity(
+            Entity("Cell spread, state of charge", "%", 1, 0.5, icon="arrow-expand-vertical", factor=100.0),
+            packs="with cell voltages",
+        ),
     ] = Field(description="highest less lowest SOC of the cells; null as weakest_cell")
     cell_r_spread: Annotated[
-        float | None, Quantity(Entity("Cell spread, resistance", None, 2, 0.02), packs="with cell voltages")
+        float | None,
+        Quantity(raw_entity("Cell spread, resistance", "%", 0)._replace(factor=100.0), packs="with cell voltages"),
     ] = Field(
         description="highest less lowest resistance of the cells, relative to their median; null as weakest_cell",
     )
@@ -166,7 +199,7 @@ class Estimate(Payload):
         Field(description=f"charged {_COUNTED} [kWh]")
     )
     equivalent_cycles: Annotated[
-        float | None, Quantity(total_entity("Equivalent cycles", None, 2), packs="batteries")
+        float | None, Quantity(total_entity("Full cycles", None, 2)._replace(icon="sync"), packs="batteries")
     ] = Field(description="charge_out_ah divided by the rated capacity; null for a fuel cell")
     voltage_estimate_v: Annotated[float | None, Quantity(raw_entity("Estimated voltage", "V", 2, "voltage"))] = Field(
         description="terminal voltage by the model: voltage_v less innovation_v [V]"

@@ -12,7 +12,7 @@ function makeCurves() {
 		soc: make("State of charge", "%", "--soc", 2, { low: 0, high: 100 }),
 		v: make("Voltage", "V", "--volt", 0.02, { second: { color: "--estimate", label: "estimated", dash: [5, 3] } }),
 		i: make("Current", "A", "--amp", 0.02),
-		inno: make("Innovation", "mV", "--inno", 2),
+		inno: new Curve($("innochart"), "Innovation", "mV", "--inno", 2),
 		temp: make("Temperature", "°C", "--inno", 2),
 	});
 }

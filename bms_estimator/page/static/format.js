@@ -9,12 +9,11 @@ export const fixed = (x, decimals) => (isNumber(x) ? withMinus(x.toFixed(decimal
 /** About four digits: three decimals below 10, two below 100, one above. */
 export const plain = (x) => fixed(x, Math.abs(x) < 9.9995 ? 3 : Math.abs(x) < 99.995 ? 2 : 1);
 
-/** A small or large number by its digits: 1.234, 0.0123, 1.23e-5. */
+/** A number with `count` digits, at most nine decimals, and no exponent: 1.234, 0.0123, 12340. */
 export function digits(x, count = 4) {
 	if (!isNumber(x)) return "";
-	const size = Math.abs(x);
-	if (size !== 0 && (size < 1e-3 || size >= 1e6)) return withMinus(x.toExponential(count - 1));
-	return withMinus(Number(x.toPrecision(count)).toString());
+	const decimals = x === 0 ? 0 : Math.min(Math.max(count - 1 - Math.floor(Math.log10(Math.abs(x))), 0), 9);
+	return withMinus(String(x.toFixed(decimals)).replace(/(\.\d*?)0+$/, "$1").replace(/\.$/, ""));
 }
 
 /** A value and its standard deviation, which determines the decimals of both. */

@@ -34,7 +34,7 @@ function draw() {
 	drawHead(pack);
 	showWhatIf(connection.broker || !f.isNumber(state.soc) ? null : pack.name); // a dashboard, which has a link to a broker, makes no forecasts
 	drawAlarms(pack);
-	drawState(state);
+	drawState(state, pack.topics.parameters?.state_of_health?.capacity);
 	drawForecastValues(state);
 	drawCells(state);
 	drawRanks(pack.topics.cells);
@@ -137,6 +137,7 @@ function choose(name) {
 	redrawAll();
 }
 
+$("expert").ontoggle = redrawAll;
 $("packs").onkeydown = (event) => {
 	const tabs = [...$("packs").children], count = tabs.length, here = tabs.indexOf(document.activeElement);
 	const next = { ArrowRight: here + 1, ArrowDown: here + 1, ArrowLeft: here - 1, ArrowUp: here - 1, Home: 0, End: -1 }[event.key];

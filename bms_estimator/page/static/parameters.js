@@ -21,7 +21,8 @@ export function drawParameters(report) {
 			rows.set(key, node("tr", { "data-p": key }, node("th", { scope: "row" }, name), ...Array.from({ length: 5 }, () => node("td", {}))));
 			$("params").append(rows.get(key));
 		}
-		const texts = [...f.withError(p.value, p.std, factor), unit, p.valid ? "✓ yes" : "no",
+		const known = p.valid || !f.isNumber(p.std) || p.std < Math.abs(p.value);
+		const texts = [...(known ? f.withError(p.value, p.std, factor) : ["not known yet", ""]), unit, p.valid ? "✓ yes" : "no",
 			p.valid ? p.source + (p.updated ? `, ${f.clock(new Date(p.updated))}` : "") : p.reason ?? ""];
 		const cells = [...rows.get(key).children].slice(1);
 		cells.forEach((cell, i) => text(cell, texts[i]));

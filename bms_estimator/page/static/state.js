@@ -6,9 +6,10 @@ import * as f from "./format.js";
 const MIN_POINT_S = 600; // shortest time to the cut-off that is shown as one number [s]
 const SHOWN = {
 	voltage_v: f.volts, voltage_estimate_v: f.volts, current_a: f.amperes, power_w: f.watts, temperature_c: f.celsius,
-	innovation_v: f.millivolts, usable_capacity_ah: f.ampereHours, remaining_energy_wh: f.wattHours, remaining_capacity_ah: f.ampereHours,
+	innovation_v: f.millivolts, device_soc: (x) => f.percent(x, 0), usable_capacity_ah: f.ampereHours, remaining_energy_wh: f.wattHours, remaining_capacity_ah: f.ampereHours,
 	energy_out_kwh: (x) => f.wattHours(1e3 * x), energy_in_kwh: (x) => f.wattHours(1e3 * x), soc: f.percent, weakest_cell_soc: f.percent, stability_margin: f.percent,
 };
+const UNCERTAIN = ["soc_std", "time_to_cutoff_s", "time_to_full_s", "remaining_energy_wh", "remaining_capacity_ah", "weakest_cell_soc"];
 const parts = [...document.querySelectorAll("[data-of]")]; // shown only if there is a value
 
 /** Time to the cut-off, or while charging to full, with its 90 % band. Below ten minutes a single load peak decides, so only the band is shown. */
@@ -20,11 +21,22 @@ function timeLeft(s) {
 	return ["To cut-off", band, `90 % band; ${f.percent(s.cutoff_within_5min, 0)} % within 5 min`];
 }
 
-export function drawState(state) {
-	const known = state.soc_known !== false, s = known ? state : { ...state, soc_std: null };
-	const time = s.time_to_cutoff_s ?? s.time_to_full_s, [label, left, band] = timeLeft(s);
+/** Capacity of new, or that it is not known yet. */
+function capacityHealth(capacity) {
+	if (!capacity?.valid) return ["not known yet", "after two full charges"];
+	return [`${f.percent(capacity.value, 0)} % of new`, `± ${f.percent(2 * capacity.std, 0)} %`];
+}
+
+export function drawState(state, capacity) {
+	const known = state.soc_known !== false, s = known ? { ...state } : { ...state, ...Object.fromEntries(UNCERTAIN.map((name) => [name, null])) };
+	s.time_left = s.time_to_cutoff_s ?? s.time_to_full_s;
+	s.capacity_health = capacity ? 1 : null;
+	const [label, left, band] = timeLeft(s), [health, note] = capacityHealth(capacity);
 	for (const [name, show] of Object.entries(SHOWN)) put(name, show(s[name]));
-	for (const part of parts) hide(part, !f.isNumber(part.dataset.of === "time_left" ? time : s[part.dataset.of]));
+	for (const part of parts) if (part.dataset.of !== "weakestcell") hide(part, !f.isNumber(s[part.dataset.of]));
+	put("capacity_health", health);
+	put("capacity_note", note);
+	put("invalid_below", f.percent(Math.max(s.delta_1, s.delta_2)));
 	put("soc_std", f.percent(f.isNumber(s.soc_std) ? 2 * s.soc_std : null));
 	put("weakest_cell_soc_std", f.percent(f.isNumber(s.weakest_cell_soc_std) ? 2 * s.weakest_cell_soc_std : null));
 	put("temperatures_c", s.temperatures_c?.map((c, i) => (f.fixed(c, 1) || "–") + (s.faulty_probes.includes(i + 1) ? " faulty" : "")).join(", ") ?? "");
@@ -41,7 +53,7 @@ export function drawState(state) {
 }
 
 function drawScale(s) {
-	const invalid = f.isNumber(s.stability_margin) ? Math.max(s.delta_1, s.delta_2) : 0, band = 2 * (s.soc_std ?? 0);
+	const band = 2 * (s.soc_std ?? 0);
 	const place = (id, name, x) => {
 		const value = `${(100 * clip(x)).toFixed(2)}%`, element = $(id);
 		if (element[name] !== value) element.style[name] = element[name] = value;
@@ -50,12 +62,7 @@ function drawScale(s) {
 	place("band", "left", s.soc - band);
 	place("band", "width", clip(s.soc + band) - clip(s.soc - band));
 	place("at", "left", s.soc);
-	for (const id of ["invalidmark", "d1", "d2"]) hide($(id), invalid <= 0);
-	for (const [id, x] of [["invalid", invalid], ["invalidmark", invalid], ["d1", s.delta_1], ["d2", s.delta_2]]) place(id, id === "invalid" ? "width" : "left", x ?? 0);
-	attribute($("invalidmark"), "class", invalid > 0.5 ? "left" : "");
-	put("invalid_below", f.percent(invalid));
-	put("deltas", f.deltas(s));
 	attribute($("fill"), "class", s.soc <= 0.1 ? "bad" : s.soc < 0.2 ? "low" : "");
 	attribute($("scale"), "aria-valuenow", String(Math.round(100 * s.soc)));
-	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %${invalid > 0 ? `; the thesis's model is not valid below ${f.percent(invalid, 0)} %` : ""}`);
+	attribute($("scale"), "aria-valuetext", `${f.percent(s.soc, 0)} %, give or take ${f.percent(band, 0)} %`);
 }

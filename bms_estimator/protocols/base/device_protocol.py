@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import NO_CELLS, NO_PROBES, SAMPLE, CellBlock, ProbeBlock, SampleBlock
+from bms_estimator.model.sample import NO_CELLS, NO_PROBES, NO_SOC, SAMPLE, CellBlock, ProbeBlock, SampleBlock
 from bms_estimator.protocols.base.probe_check import probe_block
+from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.base.sensor_correction import EXACT, SensorCorrection
 
@@ -34,6 +36,10 @@ class DeviceProtocol(ABC):
     """Cell voltages of the samples that ``feed`` or ``feed_reads`` returned last [V]."""
     probes: ProbeBlock = NO_PROBES
     """Temperature probes of the same samples; empty if the device has a single one that is never faulty."""
+    device_soc: Floats = NO_SOC
+    """SOC of the same samples by the device, 0..1, NaN without one; ``NO_SOC`` if it reports none."""
+    device_capacity_ah: float = math.nan
+    """Capacity from which the device computes its SOC, as last reported [Ah]; NaN: not reported."""
     probing: bool = False
     """True while the device is unknown. Then ``next_output`` returns only queries that change nothing in any device."""
     correction: SensorCorrection = EXACT
@@ -112,15 +118,23 @@ class DeviceProtocol(ABC):
     ) -> SampleBlock:
         """Decode many reads at once to samples as measured."""
         blocks, cells = [np.empty(0, dtype=SAMPLE)], list[Sequence[float]]()
-        probes = list[Sequence[tuple[float, bool]]]()
+        probes, soc = list[Sequence[tuple[float, bool]]](), list[float]()
         begin = 0
         for arrival_s, end in zip(arrivals_s.tolist(), ends.tolist(), strict=True):
             blocks.append(self._decode(arrival_s, data[begin:end].tobytes()))
             cells += self.cells.tolist() or [()] * blocks[-1].size
             probes += self.probes.tolist() or [()] * blocks[-1].size
+            soc += self.device_soc.tolist() or [math.nan] * blocks[-1].size
             begin = end
-        self.cells, self.probes = cell_block(cells), probe_block(probes)
+        self.cells, self.probes, self.device_soc = cell_block(cells), probe_block(probes), soc_block(soc)
         return np.concatenate(blocks)
+
+    def _store_device_values(self, readings: Sequence[Reading]) -> None:
+        """Store the SOC and the capacity that the device reports with the samples."""
+        self.device_soc = soc_block([reading.soc if 0.0 <= reading.soc <= 1.0 else math.nan for reading in readings])
+        for reading in readings:
+            if reading.capacity_ah > 0.0:
+                self.device_capacity_ah = reading.capacity_ah
 
     def serial_number_in(self, data: bytes) -> str | None:  # noqa: ARG002 - for subclasses
         """Return the serial number in ``data`` without decoding it; None if ``data`` contains none."""
@@ -160,3 +174,8 @@ def cell_block(rows: Sequence[Sequence[float]]) -> CellBlock:
     if cells == 0:
         return NO_CELLS
     return np.array([[*row, *[math.nan] * (cells - len(row))] for row in rows])
+
+
+def soc_block(soc: Sequence[float]) -> Floats:
+    """Return the SOC of samples, NaN without a value; ``NO_SOC`` without any."""
+    return NO_SOC if all(map(math.isnan, soc)) else np.array(soc)

@@ -48,6 +48,8 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
     VOLTAGE_HELD: {"": 1.0},  # 1: held, 0: measured
     CURRENT_HELD: {"": 1.0},
     "cells_v": _VOLT,
+    "device_soc": {"": 1.0},
+    "device_capacity_ah": {"ah": 1.0},
 }
 _NAMES = {
     "voltage_v": ("V", "v", "U", "u", "volt", "volts", "voltage", "vbat", "vbatt", "bus_voltage", "pack_voltage"),
@@ -58,6 +60,8 @@ _NAMES = {
     VOLTAGE_HELD: (VOLTAGE_HELD,),
     CURRENT_HELD: (CURRENT_HELD,),
     "cells_v": ("cells", "cell_voltages"),
+    "device_soc": ("device_soc",),
+    "device_capacity_ah": ("device_capacity",),
 }
 _QUANTITIES = {
     f"{name}_{unit}" if unit else name: (field, unit)
@@ -136,13 +140,24 @@ def _to_reading(named_values: Iterable[_NamedValues]) -> Reading | None:
         values_si[field] = [factor * value for value in values]
     if "voltage_v" not in values_si or "current_a" not in values_si:
         return None
-    (voltage_v,), (current_a,), (time_s,) = (
-        values_si.get(field, [nan]) for field in ("voltage_v", "current_a", "time_s")
+    voltage_v, current_a, time_s, soc, capacity_ah = (
+        values_si.get(field, [nan])[0]
+        for field in ("voltage_v", "current_a", "time_s", "device_soc", "device_capacity_ah")
     )
     temperatures_c = tuple(values_si.get("temperatures_c", values_si.get("temperature_c", ())))
     cells_v = tuple(values_si.get("cells_v", ()))
     voltage_held, current_held = (values_si.get(name, [0.0])[0] > 0.0 for name in (VOLTAGE_HELD, CURRENT_HELD))
-    return Reading(voltage_v, current_a, temperatures_c, cells_v, time_s, voltage_held, current_held)
+    return Reading(
+        voltage_v,
+        current_a,
+        temperatures_c,
+        cells_v,
+        time_s,
+        voltage_held,
+        current_held,
+        soc=soc,
+        capacity_ah=capacity_ah,
+    )
 
 
 def sample_json_line(
@@ -154,6 +169,8 @@ def sample_json_line(
     time_s: float | None = None,
     voltage_held: bool = False,
     current_held: bool = False,
+    soc: float = nan,
+    capacity_ah: float = nan,
 ) -> bytes:
     """Return the JSON line of one sample.
 
@@ -165,6 +182,8 @@ def sample_json_line(
         time_s: Timestamp by the device's clock, with any origin [s]; None: not reported.
         voltage_held: True if the voltage repeats an earlier sample.
         current_held: True if the current repeats an earlier sample.
+        soc: SOC by the device, 0..1; NaN: not reported.
+        capacity_ah: Capacity from which the device computes its SOC [Ah]; NaN: not reported.
 
     Raises:
         ValueError: Voltage or current is not finite.
@@ -183,6 +202,9 @@ def sample_json_line(
         line[VOLTAGE_HELD] = 1
     if current_held:
         line[CURRENT_HELD] = 1
+    for name, value in (("device_soc", soc), ("device_capacity_ah", capacity_ah)):
+        if math.isfinite(value):
+            line[name] = round(value, 4)
     if cells_v:
         line["cells_v"] = [_rounded(v, 4) for v in cells_v]
     return json.dumps(line, separators=(",", ":")).encode() + b"\n"

@@ -66,6 +66,7 @@ class ReadingProtocol(DeviceProtocol):
         for reading in self._read(arrival_s, data):
             readings.append(reading)
             self.last_reading, self._fault_text = reading, None
+        self._store_device_values(readings)
         self.cells = cell_block([reading.cells_v for reading in readings])
         self._counts["implausible_cells"] += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)

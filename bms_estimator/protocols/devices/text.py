@@ -102,6 +102,7 @@ class TextProtocol(DeviceProtocol):
         elif len(self._unparsed) > MAX_LINE_BYTES:
             self._begin_overlong(self._unparsed)
             self._unparsed, self._overlong = b"", True
+        self._store_device_values(readings)
         self.cells = cell_block([reading.cells_v for reading in readings])
         self._implausible_cells += remove_implausible(self.cells, MIN_CELL_V, MAX_CELL_V)
         block = np.empty(len(readings), dtype=SAMPLE)

@@ -15,6 +15,7 @@ PROFILES: dict[str, dict[str, object]] = {
         "voltage": {"signal": "PackVoltage"},
         "current": {"signal": "PackCurrent"},
         "temperature": {"signal": "PackTemperature"},
+        "soc": {"signal": "PackSoc"},
     },
 }
 """Defaults of ``[source]`` by profile. The package contains a DBC file for each profile. All of them report charge as
@@ -116,6 +117,10 @@ class CanSource(BaseSource):
     temperature: Annotated[tuple[Signal, ...], BeforeValidator(as_tuple)] = Field(
         default=(), description="signal of the temperature, written like voltage; a list for several probes"
     )
+    soc: Signal | None = Field(
+        default=None,
+        description="signal of the SOC by the BMS [%], written like voltage; it is shown beside the estimate",
+    )
     cells: tuple[CellSignals, ...] = Field(
         default=(),
         description='signals of the cell voltages, such as [{ signal = "Cell{}_mV", count = 16, scale = 0.001 }]',
@@ -124,6 +129,8 @@ class CanSource(BaseSource):
     @model_validator(mode="before")
     @classmethod
     def _merge_profile(cls, table: object) -> object:
+        if isinstance(table, dict) and "dbc" in table:  # the profile's DBC file, which may be replaced, has its SOC
+            return merge_profile(table, {name: {**each, "soc": None} for name, each in PROFILES.items()})
         return merge_profile(table, PROFILES)
 
     @model_validator(mode="after")

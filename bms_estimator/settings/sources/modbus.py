@@ -23,6 +23,7 @@ PROFILES: dict[str, dict[str, object]] = {
         "voltage": {"address": 259, "type": "uint16", "scale": 0.01, "absent": 0},
         "current": {"address": 261, "type": "int16", "scale": 0.1},
         "temperature": {"address": 262, "type": "int16", "scale": 0.1, "absent": 0},
+        "soc": {"address": 266, "type": "uint16", "scale": 0.1, "absent": 0},
     },
     # "SEPLOS-3.0 RS485 BMS Modbus RTU Protocol" V0.1 of 2023-02-09: blocks PIA and PIB, function 4, temperatures in 0.1 K.
     "seplos-v3": {
@@ -34,6 +35,8 @@ PROFILES: dict[str, dict[str, object]] = {
             {"address": address, "table": "input", "type": "uint16", "scale": 0.1, "offset": -273.15, "absent": 0}
             for address in (0x1009, 0x100C, 0x100D)
         ],
+        "soc": {"address": 0x1005, "table": "input", "type": "uint16", "scale": 0.1},
+        "capacity": {"address": 0x1003, "table": "input", "type": "uint16", "scale": 0.01},
         "cells": {"address": 0x1100, "table": "input", "type": "uint16", "scale": 0.001, "count": 16},
     },
 }
@@ -121,6 +124,14 @@ class ModbusSource(BaseSource):
     )
     temperature: Annotated[tuple[Register, ...], BeforeValidator(as_tuple)] = Field(
         default=(), description="register of the temperature, written like voltage; a list for several probes"
+    )
+    soc: Register | None = Field(
+        default=None,
+        description="register of the SOC by the device [%], written like voltage; it is shown beside the estimate",
+    )
+    capacity: Register | None = Field(
+        default=None,
+        description="register of the capacity from which the device computes its SOC [Ah], written like voltage",
     )
     cells: CellRegisters | None = Field(
         default=None,

@@ -7,27 +7,31 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from bms_estimator.model.config_file import Positive, Strict
+from bms_estimator.protocols.registry import DEVICES
 from bms_estimator.settings.broker import BrokerSettings, BrokerUrls
 from bms_estimator.settings.sources.mqtt_profiles import PROFILES, ProfileName
 from bms_estimator.settings.sources.source import BaseSource, Name, as_tuple
 
-Unit = Literal["V", "mV", "A", "mA", "C", "F", "K", "s", "ms", "iso"]
+Unit = Literal["V", "mV", "A", "mA", "C", "F", "K", "s", "ms", "iso", "%", "Ah", "mAh"]
 ALLOWED_UNITS: Mapping[str, tuple[Unit, ...]] = {
     "voltage": ("V", "mV"),
     "current": ("A", "mA"),
     "temperature": ("C", "F", "K"),
     "cells": ("V", "mV"),
     "time": ("s", "ms", "iso"),
+    "soc": ("%",),
+    "capacity": ("Ah", "mAh"),
 }
 """Units in which a quantity may be received, by quantity; the first unit is the default."""
 CONVERSIONS: Mapping[Unit, tuple[float, float]] = {
     "mV": (1e-3, 0.0),
     "mA": (1e-3, 0.0),
+    "mAh": (1e-3, 0.0),
     "ms": (1e-3, 0.0),
     "F": (5.0 / 9.0, -160.0 / 9.0),
     "K": (1.0, -273.15),
 }
-"""Factor and offset that convert a value to V, A, C or s, by unit. Values in other units are not converted."""
+"""Factor and offset that convert a value to V, A, C, s, % or Ah, by unit. Values in other units are not converted."""
 STALE_PERIODS, MIN_STALE_S = 3.0, 30.0
 """Default age at which a voltage or current is stale: in sample periods, and its minimum [s]."""
 ABSENT_PERIODS = 2.0
@@ -120,6 +124,14 @@ class MqttSource(BaseSource):
         default=None,
         description="location of the time of measurement on the publisher's clock, written like voltage; default: arrival times are used",
     )
+    soc: ValueLocation | None = Field(
+        default=None,
+        description="location of the SOC by the publisher [%], written like voltage; it is shown beside the estimate",
+    )
+    capacity: ValueLocation | None = Field(
+        default=None,
+        description="location of the capacity from which the publisher computes its SOC, written like voltage",
+    )
     settle_s: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.5,
         description="time for which a new voltage and a new current wait for each other. After it the last value of the other is used and marked as held; the estimator interpolates the current at the time of the voltage",
@@ -130,7 +142,7 @@ class MqttSource(BaseSource):
     )
     max_silent_s: Positive | None = Field(
         default=None,
-        description="longest time between two messages of a publisher that sends only changes; meanwhile the last values are used again; default: the publisher sends a value in each interval_s",
+        description="longest time between two messages of a publisher that sends only changes; meanwhile the last values are used again, and retained values count while availability_topic reports the publisher online; default: the publisher sends a value in each interval_s",
     )
     slow_max_age_s: Positive = Field(
         default=300.0, description="maximum age of a temperature or cell voltage in a sample"
@@ -253,7 +265,9 @@ class MqttSource(BaseSource):
         if self.profile is None:
             return {"voltage_resolution_v": DEFAULT_RESOLUTION_V}
         profile = PROFILES[self.profile]
+        device = DEVICES.get(profile.protocol)
         return {
+            "current_dead_band_a": device.sensor_defaults.current_dead_band_a if device else None,
             "current_sign": profile.current_sign,
             "voltage_resolution_v": profile.voltage_resolution_v,
             "current_resolution_a": profile.current_resolution_a,

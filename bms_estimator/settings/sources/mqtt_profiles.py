@@ -31,6 +31,8 @@ class Profile(NamedTuple):
     """Direction of positive current, the default of ``sensor.current_sign``."""
     voltage_resolution_v: float
     current_resolution_a: float
+    protocol: str = ""
+    """Protocol of the same BMS on a serial line, whose dead band of the current applies; empty: no dead band is known."""
     required_settings: Mapping[str, str] = {}
     """Descriptions of the settings without which the profile is incomplete, by name."""
 
@@ -39,7 +41,9 @@ _VENUS_TEMPERATURES = ("Dc/0/Temperature", "System/MinCellTemperature", "System/
 """Paths of temperatures of a battery on Venus OS. A battery without cells has only the first."""
 
 
-def _esphome_defaults(voltage: str, current: str, temperature: Sequence[str], cell: str) -> dict[str, Any]:
+def _esphome_defaults(
+    voltage: str, current: str, temperature: Sequence[str], cell: str, soc: str, capacity: str = ""
+) -> dict[str, Any]:
     """Return the defaults of an ESPHome node.
 
     Its topics are ``<topic_prefix>/sensor/<object_id>/state`` with a plain number as payload
@@ -52,6 +56,8 @@ def _esphome_defaults(voltage: str, current: str, temperature: Sequence[str], ce
         current: Name of the sensor of the current.
         temperature: Names of the sensors of the temperature, which may contain ``{probe}``.
         cell: Name of the sensors of the cell voltages, with ``{cell}``.
+        soc: Name of the sensor of the SOC.
+        capacity: Name of the sensor of the configured capacity; empty without one.
     """
 
     def topics(name: str) -> dict[str, Any]:
@@ -62,6 +68,8 @@ def _esphome_defaults(voltage: str, current: str, temperature: Sequence[str], ce
         "current": topics(current),
         "temperature": [topics(name) for name in temperature],
         "cells": topics(cell),
+        "soc": topics(soc),
+        **({"capacity": topics(capacity)} if capacity else {}),
         "availability_topic": "{prefix}/status",
     }
 
@@ -79,6 +87,8 @@ PROFILES: Mapping[ProfileName, Profile] = {
             "current": {"topic": "{prefix}/soc/current"},
             "temperature": {"topic": "{prefix}/temperatures/{probe}"},
             "cells": {"topic": "{prefix}/cell_voltages/{cell}"},
+            "soc": {"topic": "{prefix}/soc/soc_percent"},
+            "capacity": {"topic": "{prefix}/soc/capacity"},
             "interval_s": 10.0,
         },
         current_sign=DISCHARGE,
@@ -88,30 +98,51 @@ PROFILES: Mapping[ProfileName, Profile] = {
     ),
     # syssi/esphome-jk-bms, esp32-example.yaml and esp32-ble-example.yaml
     "esphome-jk": Profile(
-        _esphome_defaults("total_voltage", "current", ["temperature_sensor_{probe}"], "cell_voltage_{cell}"),
+        _esphome_defaults(
+            "total_voltage",
+            "current",
+            ["temperature_sensor_{probe}"],
+            "cell_voltage_{cell}",
+            "state_of_charge",
+            "total_battery_capacity_setting",
+        ),
         current_sign=CHARGE,
         voltage_resolution_v=0.01,
         current_resolution_a=0.01,
+        protocol="jk",
         required_settings=_required_prefix("jk-bms"),
     ),
     # syssi/esphome-jbd-bms, esp32-ble-example.yaml
     "esphome-jbd": Profile(
-        _esphome_defaults("total_voltage", "current", ["temperature_{probe}"], "cell_voltage_{cell}"),
+        _esphome_defaults(
+            "total_voltage",
+            "current",
+            ["temperature_{probe}"],
+            "cell_voltage_{cell}",
+            "state_of_charge",
+            "nominal_capacity",
+        ),
         current_sign=CHARGE,
         voltage_resolution_v=0.01,
         current_resolution_a=0.01,
+        protocol="jbd",
         required_settings=_required_prefix("jbd-bms-ble"),
     ),
     # ESPHome's daly_bms, with the sensor names and the interval of 20 s of its documentation. The sign is that of the
     # frame (esphome/components/daly_bms/daly_bms.cpp), as in protocols/devices/daly.py
     "esphome-daly": Profile(
         _esphome_defaults(
-            "battery_voltage", "battery_current", ["max_temperature", "min_temperature"], "cell_{cell}_voltage"
+            "battery_voltage",
+            "battery_current",
+            ["max_temperature", "min_temperature"],
+            "cell_{cell}_voltage",
+            "battery_level",
         )
         | {"interval_s": 20.0},
         current_sign=DISCHARGE,
         voltage_resolution_v=0.1,
         current_resolution_a=0.1,
+        protocol="daly",
         required_settings=_required_prefix("daly-bms"),
     ),
     # victronenergy/dbus-flashmq, README: values are published on change and on request; a keep-alive lasts 60 s.
@@ -124,12 +155,16 @@ PROFILES: Mapping[ProfileName, Profile] = {
                 {"topic": f"N/{{prefix}}/battery/{{instance}}/{path}", "path": "value"} for path in _VENUS_TEMPERATURES
             ],
             "cells": {"topic": "N/{prefix}/battery/{instance}/Voltages/Cell{cell}", "path": "value"},
+            "soc": {"topic": "N/{prefix}/battery/{instance}/Soc", "path": "value"},
+            "capacity": {"topic": "N/{prefix}/battery/{instance}/InstalledCapacity", "path": "value"},
             "ask": {
                 "R/{prefix}/keepalive": '{"keepalive-options":["suppress-republish"]}',
                 "R/{prefix}/battery/{instance}/Dc/0/Voltage": "",
                 "R/{prefix}/battery/{instance}/Dc/0/Current": "",
                 **{f"R/{{prefix}}/battery/{{instance}}/{path}": "" for path in _VENUS_TEMPERATURES},
                 "R/{prefix}/battery/{instance}/Voltages": "",
+                "R/{prefix}/battery/{instance}/Soc": "",
+                "R/{prefix}/battery/{instance}/InstalledCapacity": "",
             },
             "ask_s": 2.0,
             "interval_s": 2.0,
@@ -152,6 +187,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
                 {"topic": "{prefix}/info{instance}", "path": path} for path in ("temperature_max", "temperature_min")
             ],
             "cells": {"topic": "{prefix}/spec_data{instance}", "path": "cell_voltages"},
+            "soc": {"topic": "{prefix}/info{instance}", "path": "SOC_real"},
             "availability_topic": "{prefix}/status",
         },
         current_sign=CHARGE,
@@ -169,6 +205,7 @@ PROFILES: Mapping[ProfileName, Profile] = {
                 {"topic": "{prefix}/battery/BatteryTempTwoCelsius"},
             ],
             "cells": {"topic": "{prefix}/battery/Cell{cell}MilliVolt", "unit": "mV"},
+            "soc": {"topic": "{prefix}/battery/stateOfCharge"},
             "availability_topic": "{prefix}/dtu/status",
         },
         current_sign=CHARGE,

@@ -94,9 +94,7 @@ class SetupSession:
         comparison = Comparison(devices[name])
         self.measured = await comparison.measure()
         self._comparison, self.comparisons = comparison, []
-        self.answers = Answers(
-            devices[name], self.measured.voltage_v, name=self.file.stem, found_broker=self.result.broker
-        )
+        self.answers = Answers(devices[name], self.measured, name=self.file.stem, found_broker=self.result.broker)
         self.step = Step.MULTIMETER
 
     async def compare(self, quantity: str, text: str) -> None:
@@ -142,7 +140,7 @@ class SetupSession:
             return
         self.invalid, answers = {}, self.answers
         self.texts = {name: without_secrets(text) for name, text in texts.items()}
-        for question in QUESTIONS:
+        for question in filter(lambda each: each.is_asked(answers), QUESTIONS):
             text = texts.get(question.name, "").strip() or question.suggest(answers)
             try:
                 answers = question.answer(text, answers)

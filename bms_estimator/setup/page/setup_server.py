@@ -9,6 +9,7 @@ from pathlib import Path
 
 from aiohttp import web
 
+from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.page.event_stream import LatestValues
@@ -16,6 +17,7 @@ from bms_estimator.page.page_server import FILES as PAGE_FILES
 from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.setup.answers import InvalidAnswerError
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.page.session import SetupSession
 from bms_estimator.setup.page.view import KEY_FIELD, page
 
@@ -50,6 +52,7 @@ class SetupServer(WebServer):
         self._form_key, self._lock = secrets.token_hex(16), asyncio.Lock()
         steps: dict[str, Callable[[Fields], Awaitable[None]]] = {
             "/search": self._search,
+            "/login": self._log_in,
             "/device": self._choose_device,
             "/compare/voltage": functools.partial(self._compare, "voltage"),
             "/compare/zero": functools.partial(self._compare, "zero"),
@@ -107,10 +110,16 @@ class SetupServer(WebServer):
         return web.Response(status=303, headers={"Location": "/"})
 
     async def _search(self, fields: Fields) -> None:
-        places = fields.get("places", "").split()
+        hidden = {without_secrets(place): place for place in self._session.places}  # the form shows no password
+        places = [hidden.get(place, place) for place in fields.get("places", "").split()]
         if not places:
             raise UserError("name at least one place to search")
         self._session.start_search(places)
+
+    async def _log_in(self, fields: Fields) -> None:
+        """Search the broker again that requires a user name and a password."""
+        login = BrokerLogin(*(fields.get(name, "") for name in ("url", "username", "password")))
+        self._session.start_search([login.address])
 
     async def _choose_device(self, fields: Fields) -> None:
         await self._session.choose_device(fields.get("device", ""))

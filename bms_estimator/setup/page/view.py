@@ -6,6 +6,7 @@ from html import escape
 
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.config_file import without_secrets
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.first_estimate import load_note
 from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
 from bms_estimator.setup.new_pack import run_command
@@ -62,7 +63,7 @@ def _search(session: SetupSession, form_key: str) -> str:
     places = escape("\n".join(map(without_secrets, session.places)))
     content = (
         '<label>Where to search<textarea name="places" rows="4">' + places + "</textarea></label>"
-        '<p class="note">One place per line: path of a serial port, URL of an MQTT broker (mqtt://host), host name of a '
+        '<p class="note">One place per line: path of a serial port, URL of an MQTT broker (mqtt://user:password@host), host name of a '
         "Modbus device, or bluetooth. A serial port takes up to 20 s.</p>"
     )
     found = session.step is Step.DEVICE and bool(session.result.devices)
@@ -86,7 +87,19 @@ def _device(session: SetupSession, form_key: str) -> str:
     )
     form = _form("device", form_key, devices, "Use this device") if devices else "<p>No device was found.</p>"
     failures = f'<ul class="note">{_items(session.result.failures)}</ul>' if session.result.failures else ""
-    return f'<section class="card"><h2>Found</h2>{form}{failures}</section>{_search(session, form_key)}'
+    logins = "".join(_login(login, form_key) for login in session.result.closed)
+    return f'<section class="card"><h2>Found</h2>{form}{failures}</section>{logins}{_search(session, form_key)}'
+
+
+def _login(login: BrokerLogin, form_key: str) -> str:
+    """Return the form with the user name and the password for a broker, which is then searched again."""
+    url = escape(login.url)
+    fields = (
+        f'<input type="hidden" name="url" value="{url}">'
+        '<label>User name<input name="username" autocomplete="off" required></label>'
+        '<label>Password<input name="password" type="password" autocomplete="off" required></label>'
+    )
+    return f'<section class="card"><h2>Log in at {url}</h2>{_form("login", form_key, fields, "Log in")}</section>'
 
 
 def _multimeter(session: SetupSession, form_key: str) -> str:
@@ -110,7 +123,8 @@ def _multimeter(session: SetupSession, form_key: str) -> str:
 
 
 def _pack(session: SetupSession, form_key: str) -> str:
-    fields = "".join(_question(session, question) for question in QUESTIONS)
+    asked = [each for each in QUESTIONS if session.answers and each.is_asked(session.answers)]
+    fields = "".join(_question(session, question) for question in asked)
     return f'<section class="card">{_form("pack", form_key, fields, "Write the settings file")}</section>'
 
 

@@ -28,6 +28,10 @@ MIN_EXPIRY_S = 30
 _ALARM_CLASSES: Mapping[str, str] = {name: kind.device_class for name, kind in ALARM_KINDS.items()}
 _ALARM_AVAILABILITY = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
 """Template of an alarm's availability. A raised alarm stays available even if its quantity is lost later."""
+FORMER = ("r_s_ohm",)
+"""Keys of sensors of former versions, which Home Assistant removes."""
+_SOC_HINT = "{{ {'hint': '' if value_json.soc_percent is number else 'not known yet: charge the pack to full once, or let it rest for ten minutes'} | tojson }}"
+"""Template of the attribute that says what helps while the state of charge is not known."""
 NAMEABLE = {*BATTERY, *FUEL_CELL, *CELL_VOLTAGES, CELL, *ALARMS, *get_args(Command)}
 """Entities that ``[home_assistant.names]`` may rename."""
 
@@ -100,6 +104,11 @@ def discovery(
             for key, entity in sensors
             if entity.signed
         },
+        **{
+            key: _sensor(key, entity, root, expiry_s) | _attributes(root, _SOC_HINT)
+            for key, entity in sensors
+            if key == "soc_percent"
+        },
         **{f"alarm_{name}": _alarm(name, root) for name in inputs.alarms},
         **{name: _COMMANDS[name](root) for name in inputs.commands},
     }
@@ -122,7 +131,7 @@ def _removed_components(inputs: DiscoveryInputs) -> dict[str, dict[str, str]]:
 
     Home Assistant removes a component if the message contains only its platform.
     """
-    platforms = {f"alarm_{name}": "binary_sensor" for name in inputs.unwatched}
+    platforms = {f"alarm_{name}": "binary_sensor" for name in inputs.unwatched} | dict.fromkeys(FORMER, "sensor")
     platforms |= {name: control("")["platform"] for name, control in _COMMANDS.items() if name not in inputs.commands}
     return {key: {"platform": platform} for key, platform in platforms.items()}
 
@@ -156,6 +165,7 @@ def _sensor(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
         "value_template": f"{{{{ value_json.{key} }}}}",
         "unit_of_measurement": entity.unit,
         "device_class": entity.device_class,
+        "icon": entity.icon and f"mdi:{entity.icon}",
         "state_class": entity.state_class,
         "suggested_display_precision": entity.decimals,
         "entity_category": None if entity.is_primary else "diagnostic",
@@ -168,6 +178,10 @@ def _sensor(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
 def _current_sign_attribute(root: str, positive_direction: str) -> dict[str, str]:
     """Return the attribute with the direction of positive current."""
     template = f"{{{{ {{'positive': '{positive_direction}'}} | tojson }}}}"
+    return _attributes(root, template)
+
+
+def _attributes(root: str, template: str) -> dict[str, str]:
     return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
 
 

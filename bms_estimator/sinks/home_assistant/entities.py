@@ -11,16 +11,16 @@ from bms_estimator.model.quantity import Entity, field_entities, raw_entity
 ESTIMATE = field_entities(Estimate, "all")
 """Entities of every pack."""
 CHARGE_STATE = field_entities(Estimate, "batteries") | {
-    "soc_std_percent": Entity("State of charge, standard deviation", "%", decimals=1, step=0.2, is_primary=True),
-    "time_to_cutoff_h": Entity("Time to cut-off", "h", decimals=2, step=0.05, device_class="duration", is_primary=True),
+    "soc_std_percent": Entity("State of charge, standard deviation", "%", 1, 0.2, icon="plus-minus-variant"),
+    "time_to_cutoff_h": Entity("Time to cut-off", "h", 2, 0.05, "duration", is_primary=True, icon="timer-sand"),
     "time_to_cutoff_p05_h": raw_entity("Time to cut-off, 5 % quantile", "h", 2, "duration"),
     "time_to_cutoff_p95_h": raw_entity("Time to cut-off, 95 % quantile", "h", 2, "duration"),
     "cutoff_within_15min_percent": Entity(
-        "Probability of cut-off within 15 min", "%", decimals=0, step=5.0, is_primary=True
+        "Probability of cut-off within 15 min", "%", 0, 5.0, is_primary=True, icon="power-plug-off"
     ),
-    "time_to_full_h": Entity("Time to full", "h", decimals=2, step=0.05, device_class="duration", is_primary=True),
-    "soh_percent": Entity("State of health", "%", decimals=1, step=0.2),
-    "soh_std_percent": Entity("State of health, standard deviation", "%", decimals=1, step=0.2),
+    "time_to_full_h": Entity("Time to full", "h", 2, 0.05, "duration", is_primary=True, icon="battery-clock"),
+    "soh_percent": Entity("State of health, capacity of new", "%", 1, 0.2, icon="battery-heart-variant"),
+    "soh_std_percent": raw_entity("State of health, standard deviation", "%", 1),
 }
 """Entities of a battery that a fuel cell does not have.
 
@@ -31,7 +31,7 @@ CELL_VOLTAGES = field_entities(Estimate, "with cell voltages")
 CELL = "cell_v"
 """Key in ``[home_assistant.names]`` that renames the voltages of all single cells; each name ends in the number."""
 ELEMENTS = {
-    "r_s_ohm": Entity("R_s", "Ω", decimals=4, step=0.0005),
+    "r_s_mohm": Entity("Internal resistance R_s", "mΩ", decimals=1, step=0.5, icon="resistor"),
     # ``raw_entity``: internal value, disabled by default; its minimum change is one unit of the last decimal
     "r_ts_ohm": raw_entity("R_ts", "Ω", 4),
     "r_tl_ohm": raw_entity("R_tl", "Ω", 4),

@@ -28,6 +28,7 @@ from bms_estimator.sinks.home_assistant.discovery import (
 )
 from bms_estimator.sinks.home_assistant.entities import cell_key, entities
 from bms_estimator.sinks.mqtt.topics import schema
+from bms_estimator.sinks.mqtt.venus_os import venus_battery
 
 MAX_ROWS_PER_MINUTE = 18
 """Maximum number of published values of default-enabled entities in a minute. With two values of alarms, the recorder
@@ -36,6 +37,14 @@ MINUTE_S = 60.0
 """Length of the window for ``MAX_ROWS_PER_MINUTE`` [s]."""
 MESSAGE_INTERVAL_S = 5.0
 """Minimum interval between two messages with values [s]."""
+JOINT = ("voltage_v", "current_a", "power_w")
+"""Values of one moment, which are published together."""
+UNCERTAIN = (
+    *("soc_percent", "remaining_capacity_ah", "remaining_energy_wh", "usable_capacity_ah"),
+    *("usable_capacity_to_weakest_ah", "weakest_cell_soc", "time_to_full_h", "cutoff_within_15min_percent"),
+    *("time_to_cutoff_h", "time_to_cutoff_p05_h", "time_to_cutoff_p95_h"),
+)
+"""Values that are unknown while the SOC is not known."""
 HEARTBEAT_S = 10.0
 """Interval at which unchanged values are repeated, so that they do not expire [s]."""
 
@@ -69,15 +78,15 @@ def values_to_publish(
         return published
     entities_by_key = entities(discovery.info, discovery.cells)
     values = _round_values(snapshot, entities_by_key, sign)
-    changed = {
-        key: value for key, value in values.items() if _is_due(published, key, value, entities_by_key[key], now_s)
-    }
+    due = {key for key, value in values.items() if _is_due(published, key, value, entities_by_key[key], now_s)}
+    changed = {key: value for key, value in values.items() if key in due or (key in JOINT and due & {*JOINT})}
     recent_s = tuple(at_s for at_s in published.rows_s if now_s - at_s < MINUTE_S)
     # first values are not limited, because all entities get one at once
     rows = [key for key in changed if entities_by_key[key].enabled and key in published.values]
     rows.sort(key=lambda key: published.changed_s[key])
     for postponed in rows[MAX_ROWS_PER_MINUTE - len(recent_s) :]:
-        del changed[postponed]
+        for key in JOINT if postponed in JOINT else (postponed,):
+            changed.pop(key, None)
     if not changed and elapsed_s < HEARTBEAT_S:
         return published
     return published._replace(
@@ -93,8 +102,8 @@ def _round_values(snapshot: Snapshot, entities_by_key: Mapping[str, Entity], sig
     values, rounded = _values(snapshot), dict[str, float | None]()
     for key, entity in entities_by_key.items():
         value = values.get(key)
-        if value is not None and entity.signed:
-            value *= sign
+        if value is not None:
+            value *= (sign if entity.signed else 1.0) * entity.factor
         # `or None` makes round() return an integer, `or 0` replaces -0.0
         rounded[key] = None if value is None else round(value, entity.decimals or None) or 0
     return rounded
@@ -104,21 +113,22 @@ def _values(snapshot: Snapshot) -> dict[str, float | None]:
     """Return all values of a snapshot by the keys of the entities."""
     estimate, parameters = snapshot.estimate, snapshot.parameters
     assert estimate is not None  # noqa: S101 - for the type checker: the caller has checked it
-    health = parameters.state_of_health.get("capacity")
-    return {
+    health, resistance = parameters.state_of_health.get("capacity"), parameters.elements.get("r_s_ohm")
+    values = {
         **vars(estimate),
         **{key: element.value for key, element in parameters.elements.items()},
-        "soc_percent": estimate.soc_percent if estimate.soc_known else None,
         "soc_std_percent": _scale(100.0, estimate.soc_std),
+        "r_s_mohm": _scale(1e3, resistance.value if resistance else None),
         "time_to_cutoff_h": _scale(1.0 / 3600.0, estimate.time_to_cutoff_s),
         "time_to_cutoff_p05_h": _scale(1.0 / 3600.0, estimate.time_to_cutoff_p05_s),
         "time_to_cutoff_p95_h": _scale(1.0 / 3600.0, estimate.time_to_cutoff_p95_s),
         "cutoff_within_15min_percent": _scale(100.0, estimate.cutoff_within_15min),
         "time_to_full_h": _scale(1.0 / 3600.0, estimate.time_to_full_s),
-        "soh_percent": _scale(100.0, health.value if health else None),
-        "soh_std_percent": _scale(100.0, health.std if health else None),
+        "soh_percent": _scale(100.0, health.value if health and health.valid else None),
+        "soh_std_percent": _scale(100.0, health.std if health and health.valid else None),
         **{cell_key(number): volts for number, volts in enumerate(estimate.cells_v or (), start=1)},
     }
+    return values if estimate.soc_known or estimate.soc is None else values | dict.fromkeys(UNCERTAIN)
 
 
 def _scale(factor: float, value: float | None) -> float | None:
@@ -140,6 +150,8 @@ AVAILABILITY = "availability"
 """Topic of the service's availability, below the device's topic."""
 SENSOR_AVAILABILITY = "sensor/availability"
 """Topic of the sensor's availability, below the device's topic."""
+VENUS = "venus"
+"""Topic of the battery for Venus OS, below the device's topic."""
 ANNOUNCED_ALARMS = ("collapse_risk",)
 """Alarms with an entity in Home Assistant before their first value, which follows only after minutes of load."""
 
@@ -189,6 +201,7 @@ class MessageBuilder:
             expire later with a longer period.
         home_assistant: Settings of Home Assistant.
         alarms: Monitored alarms; retained messages of others are removed.
+        venus_limits: Limits for Venus OS (``venus_battery``); None: nothing is published for it.
 
     Attributes:
         root: Root of all topics.
@@ -205,7 +218,9 @@ class MessageBuilder:
         sample_period_s: float = 0.0,
         home_assistant: HomeAssistantSettings | None = None,
         alarms: Collection[str] = ALARMS,
+        venus_limits: Mapping[str, float] | None = None,
     ) -> None:
+        self._venus_limits = venus_limits
         self._unwatched = tuple(name for name in ALARMS if name not in alarms)
         self._announced = {name for name in ANNOUNCED_ALARMS if name in alarms}
         self.root = f"{base_topic}/{device}"
@@ -262,6 +277,9 @@ class MessageBuilder:
             text = self._discovery(discovery_inputs)
             if sent.discovery_inputs is None or text != self._discovery(sent.discovery_inputs):
                 messages.append(Message(discovery_topic(self._home_settings, self._device), text, qos=1, retain=True))
+        if snapshot.estimate and self._venus_limits is not None:
+            battery = venus_battery(snapshot.estimate, snapshot.info, snapshot.alarms, self._venus_limits)
+            messages += [self._live(VENUS, _json(battery))] if battery else []
         values, entity_states = self._home_assistant(sent.entity_states, snapshot, discovery_inputs, now_s)
         return messages + values, PublishedState(snapshot, entity_states, discovery_inputs)
 

@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import math
 import secrets
-from collections.abc import Awaitable, Callable, Collection, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
 from typing import Self
 
 import structlog
@@ -139,6 +139,7 @@ class MqttSink:
         sample_period_s: Sample period, if it may exceed the publish period [s].
         home_assistant: Settings of Home Assistant.
         alarms: Monitored alarms.
+        venus_limits: Limits for Venus OS; None: nothing is published for it.
         first_delay_s: Delay after a lost connection or a temporary rejection [s].
         birth_delay_s: Delay from Home Assistant's birth message to the retained messages [s].
         echo_s: Time within which a broker must return ``online`` [s].
@@ -159,6 +160,7 @@ class MqttSink:
         sample_period_s: float = 0.0,
         home_assistant: HomeAssistantSettings | None = None,
         alarms: Collection[str] = ALARMS,
+        venus_limits: Mapping[str, float] | None = None,
         first_delay_s: float = FIRST_DELAY_S,
         birth_delay_s: float = BIRTH_DELAY_S,
         echo_s: float = ECHO_S,
@@ -167,7 +169,9 @@ class MqttSink:
         self._denied = DeniedTopics(delivery, self._republish, first_delay_s)
         self._outbox_sender = OutboxSender(outbox, delivery, self._denied, first_delay_s)
         self._birth_delay_s = birth_delay_s
-        self._messages = MessageBuilder(settings.base_topic, device, sample_period_s, home_assistant, alarms)
+        self._messages = MessageBuilder(
+            settings.base_topic, device, sample_period_s, home_assistant, alarms, venus_limits
+        )
         self._birth_topic = (home_assistant or HomeAssistantSettings()).status_topic
         identifier, will = f"bms-{device}-{secrets.token_hex(4)}", self._messages.offline_messages()[-1]
         options = ConnectOptions(identifier, will, lambda kind, topic: requests.count_refusal(kind, topic[:MAX_SHOWN]))

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.sinks.mqtt.messages import SENSOR_AVAILABILITY
 from bms_estimator.sinks.terminal.json_fields import JsonFields
-from bms_estimator.telemetry.cutoff_text import clock_duration
+from bms_estimator.telemetry.state import clock_duration
 
 ALARM_PREFIX = "alarm/"
 """Prefix of alarm topics."""

@@ -28,7 +28,8 @@ def convert_sample(sample: Mapping[str, Any]) -> Reading | None:
     if math.isnan(voltage_v) or math.isnan(current_a):
         return None
     cells_v = tuple(_number(cell) for cell in sample.get("cell_voltages", ()))
-    return Reading(voltage_v, current_a, _temperatures_c(sample), cells_v)
+    soc, capacity_ah = _number(sample.get("battery_level")) / 100.0, _number(sample.get("design_capacity"))
+    return Reading(voltage_v, current_a, _temperatures_c(sample), cells_v, soc=soc, capacity_ah=capacity_ah)
 
 
 def _temperatures_c(sample: Mapping[str, Any]) -> tuple[float, ...]:
@@ -153,7 +154,12 @@ class BleProducer(LineProducer):
             return None
         self._fault = None
         return sample_json_line(
-            reading.voltage_v, reading.current_a, temperatures_c=reading.temperatures_c, cells_v=reading.cells_v
+            reading.voltage_v,
+            reading.current_a,
+            temperatures_c=reading.temperatures_c,
+            cells_v=reading.cells_v,
+            soc=reading.soc,
+            capacity_ah=reading.capacity_ah,
         )
 
     async def _find(self) -> tuple[BLEDevice, type[BaseBMS]]:

@@ -2,6 +2,7 @@
 
 import csv
 import gzip
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
 
-OCV_COLUMNS = ("soc", "ocv_v", "hysteresis_v")
+OCV_COLUMNS = ("soc", "ocv_v", "hysteresis_v", "std_v")
 POLARISATION_COLUMNS = ("current_a", "voltage_v", "temperature_c")
 
 
@@ -21,10 +22,12 @@ class CurveColumns(NamedTuple):
     soc: Floats
     ocv_v: Floats
     hysteresis_v: Floats | None
+    std_v: Floats | None
+    """Standard deviation of ``ocv_v``."""
 
 
 def read_curve(path: Path) -> CurveColumns | None:
-    """Read the curve in a CSV file (.gz) with columns soc (0..1), ocv_v [V] and optional hysteresis_v [V].
+    """Read the curve in a CSV file (.gz) with columns soc (0..1), ocv_v [V] and optional hysteresis_v and std_v [V].
 
     Returns:
         None if the file is not CSV or has no such columns.
@@ -35,8 +38,7 @@ def read_curve(path: Path) -> CurveColumns | None:
     rows = _rows(path, OCV_COLUMNS)
     if rows is None:
         return None
-    hysteresis_v = rows[:, 2]
-    return _make_curve(path, rows, has_hysteresis=not np.isnan(hysteresis_v).all())
+    return _make_curve(path, rows)
 
 
 def read_polarisation(path: Path) -> Floats | None:
@@ -57,10 +59,10 @@ def read_polarisation(path: Path) -> Floats | None:
     return rows
 
 
-def _rows(path: Path, columns: tuple[str, str, str], excluded_column: str = "") -> Floats | None:
-    """Return three columns of a CSV file, shape (n, 3), or None if the file does not have the first two.
+def _rows(path: Path, columns: Sequence[str], excluded_column: str = "") -> Floats | None:
+    """Return columns of a CSV file, shape (n, columns), or None if the file does not have the first two.
 
-    The third column is optional, and NaN if absent. A file that has the column ``excluded_column`` is not read.
+    The other columns are optional, and NaN if absent. A file that has the column ``excluded_column`` is not read.
     """
     if not path.is_file() or not path.name.lower().endswith((".csv", ".csv.gz")):
         return None
@@ -72,7 +74,7 @@ def _rows(path: Path, columns: tuple[str, str, str], excluded_column: str = "") 
             values = [[_number(path, rows.line_num, name, row.get(name)) for name in columns] for row in rows]
     except (OSError, EOFError, UnicodeDecodeError):
         return None  # the reader of captures reports errors
-    return np.array(values).reshape(-1, 3)
+    return np.array(values).reshape(-1, len(columns))
 
 
 def _number(path: Path, line: int, name: str, cell: str | None) -> float:
@@ -84,17 +86,20 @@ def _number(path: Path, line: int, name: str, cell: str | None) -> float:
         raise UserError(f"{path}: line {line}: {name} = {cell!r}: must be a number") from None
 
 
-def _make_curve(path: Path, values: Floats, has_hysteresis: bool) -> CurveColumns:
+def _make_curve(path: Path, values: Floats) -> CurveColumns:
     """Sort and check the values of a curve.
 
     Raises:
-        UserError: A value is missing, or the SOC is outside 0..1.
+        UserError: A value is missing, the SOC is outside 0..1, or a std is not above 0.
     """
     values = values[np.argsort(values[:, 0], kind="stable")]
-    soc, ocv_v, hysteresis_v = values.T
-    required_values = values if has_hysteresis else values[:, :2]
-    if soc.size == 0 or not np.isfinite(required_values).all():
+    soc, ocv_v, *optional = values.T
+    given = [None if np.isnan(column).all() else column for column in optional]
+    if soc.size == 0 or not all(np.isfinite(column).all() for column in (soc, ocv_v, *given) if column is not None):
         raise UserError(f"{path}: {'no rows' if soc.size == 0 else 'a value is missing'}: give numbers in every column")
     if soc[0] < 0.0 or soc[-1] > 1.0:
         raise UserError(f"{path}: soc runs from {soc[0]:g} to {soc[-1]:g}: must lie within 0..1, not percent")
-    return CurveColumns(soc, ocv_v, hysteresis_v if has_hysteresis else None)
+    hysteresis_v, std_v = given
+    if std_v is not None and std_v.min() <= 0.0:
+        raise UserError(f"{path}: std_v = {std_v.min():g}: must be above 0 (standard deviation of ocv_v in volts)")
+    return CurveColumns(soc, ocv_v, hysteresis_v, std_v)

@@ -11,10 +11,11 @@ from typing import Protocol, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress, no_progress
-from bms_estimator.model.sample import NO_PROBES, SAMPLE, CellBlock, CurrentSign, ProbeBlock, SampleBlock
+from bms_estimator.model.sample import NO_PROBES, NO_SOC, SAMPLE, CellBlock, CurrentSign, ProbeBlock, SampleBlock
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
@@ -209,12 +210,17 @@ class Replay:
             before = self.fraction
             for part in _parts(block["time_s"], self._max_block_s):
                 self._advance(before, part.stop / block.size)
-                yield ReceivedSamples(block[part], cells[part], probes[part])
+                yield ReceivedSamples(block[part], cells[part], probes[part], self._device_soc[part])
 
     @property
     def _probes(self) -> ProbeBlock:
         """Temperature probes of the last block, which only a raw capture has."""
         return self.capture.probes if isinstance(self.capture, RawCapture) else NO_PROBES
+
+    @property
+    def _device_soc(self) -> Floats:
+        """SOC of the last block by the device, which only a raw capture has."""
+        return self._decoder.device_soc if self._decoder else NO_SOC
 
     def _advance(self, before: float, fraction_of_block: float) -> None:
         """Set ``fraction`` within a block, which began at the fraction ``before``."""
@@ -231,7 +237,10 @@ class Replay:
                 end = int(np.searchsorted(due_s, now_s, side="right"))
                 if end > first:
                     self._advance(before, end / block.size)
-                    yield ReceivedSamples(block[first:end], self.capture.cells[first:end], self._probes[first:end])
+                    part = slice(first, end)
+                    yield ReceivedSamples(
+                        block[part], self.capture.cells[part], self._probes[part], self._device_soc[part]
+                    )
                     first = end
                 else:
                     await asyncio.sleep(min((due_s[first] - now_s) / speed + PACED_INTERVAL_S, 1.0))

@@ -154,7 +154,12 @@ class CanProducer(LineProducer):
         data = bytes(message.data)
         reading = self._decoder.feed(time.monotonic(), message.arbitration_id, message.is_extended_id, data)
         return reading and sample_json_line(
-            reading.voltage_v, reading.current_a, temperatures_c=reading.temperatures_c, cells_v=reading.cells_v
+            reading.voltage_v,
+            reading.current_a,
+            temperatures_c=reading.temperatures_c,
+            cells_v=reading.cells_v,
+            soc=reading.soc,
+            capacity_ah=reading.capacity_ah,
         )
 
 

@@ -145,6 +145,7 @@ class CanDecoder:
             self._newest_value("current", now_s, max_age_s=self._max_distance_s),
             tuple(self._newest_value("temperature", now_s, number) for number in range(self._probe_count)),
             () if all(map(math.isnan, cells_v)) else cells_v,
+            soc=self._newest_value("soc", now_s) / 100.0,
         )
 
     def _newest_value(self, quantity: str, now_s: float, number: int = 0, max_age_s: float = MAX_AGE_S) -> float:
@@ -158,6 +159,8 @@ def _signals(settings: CanSource) -> Iterator[tuple[SignalKey, Signal]]:
     yield ("voltage", 0), settings.voltage
     yield ("current", 0), settings.current
     yield from ((("temperature", number), signal) for number, signal in enumerate(settings.temperature))
+    if settings.soc is not None:
+        yield ("soc", 0), settings.soc
     members = [signal for cells in settings.cells for signal in cells.cell_signals()]
     yield from ((("cells", number), signal) for number, signal in enumerate(members))
 

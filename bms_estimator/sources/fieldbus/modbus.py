@@ -68,6 +68,8 @@ def list_values(settings: ModbusSource) -> tuple[RegisterQuantity, ...]:
     """Return the values to read from the device."""
     values = [RegisterQuantity("voltage", settings.voltage), RegisterQuantity("current", settings.current)]
     values += [RegisterQuantity("temperature", register) for register in settings.temperature]
+    optional = (("soc", settings.soc), ("capacity", settings.capacity))
+    values += [RegisterQuantity(name, register) for name, register in optional if register is not None]
     if settings.cells is not None:
         values += [RegisterQuantity("cells", settings.cells.cell(number)) for number in range(settings.cells.count)]
     return tuple(values)
@@ -124,12 +126,15 @@ def decode_reading(values: Sequence[RegisterQuantity], words: Words) -> Reading 
     decoded: dict[str, list[float]] = {}
     for quantity, register in values:
         decoded.setdefault(quantity, []).append(decode(register, words))
-    (voltage_v,), (current_a,) = (decoded.get(name, [math.nan]) for name in ("voltage", "current"))
+    voltage_v, current_a, soc, capacity_ah = (
+        decoded.get(name, [math.nan])[0] for name in ("voltage", "current", "soc", "capacity")
+    )
     if math.isnan(voltage_v) or math.isnan(current_a):
         return None
     cells_v = tuple(decoded.get("cells", ()))
     temperatures_c = tuple(decoded.get("temperature", ()))
-    return Reading(voltage_v, current_a, temperatures_c, () if all(map(math.isnan, cells_v)) else cells_v)
+    cells_v = () if all(map(math.isnan, cells_v)) else cells_v
+    return Reading(voltage_v, current_a, temperatures_c, cells_v, soc=soc / 100.0, capacity_ah=capacity_ah)
 
 
 Client = AsyncModbusSerialClient | AsyncModbusTcpClient
@@ -236,7 +241,12 @@ class ModbusProducer(LineProducer):
             return None
         self._fault = None
         return sample_json_line(
-            reading.voltage_v, reading.current_a, temperatures_c=reading.temperatures_c, cells_v=reading.cells_v
+            reading.voltage_v,
+            reading.current_a,
+            temperatures_c=reading.temperatures_c,
+            cells_v=reading.cells_v,
+            soc=reading.soc,
+            capacity_ah=reading.capacity_ah,
         )
 
     async def _read(self, client: Client) -> Mapping[tuple[Table, int], int]:

@@ -80,8 +80,8 @@ class MqttProducer(LineProducer):
 
     @property
     def fault(self) -> str | None:
-        """Fault of the assembler."""
-        return self._assembler.fault
+        """Fault of the assembler. It is read only while no samples arrive."""
+        return self._assembler.fault or self._assembler.silence_reason
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """Yield a line for each complete sample. Each call tries the next broker.

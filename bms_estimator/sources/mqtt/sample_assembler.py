@@ -20,6 +20,10 @@ from bms_estimator.sources.mqtt.publisher_conflict import MIN_JUMPS, PublisherCo
 
 REQUIRED_QUANTITIES = ("voltage", "current")
 """Quantities without which there is no sample."""
+TIMED_QUANTITIES = (*REQUIRED_QUANTITIES, "time")
+"""Quantities whose values always become too old."""
+MAX_RETAINED = 1000
+"""Maximum number of retained messages that wait for the status of the publisher."""
 REPEAT_PERIODS = 1.5
 """Time without a message after which the last current is used again if the publisher sends only changes, in sample periods. A
 regular message may be half a period late."""
@@ -96,6 +100,8 @@ class SampleAssembler:
         ]
         self._availability_topic = settings.substitute(settings.availability_topic or "")
         self._offline_status = ""  # latest status from the publisher or its last will
+        self._is_online = False  # True if the latest status is not offline
+        self._retained: dict[str, bytes] = {}  # retained messages that wait for the status, by topic
         self._max_age_s = dict.fromkeys(settings.quantities, settings.slow_max_age_s) | {
             **dict.fromkeys(REQUIRED_QUANTITIES, settings.stale_s),
             "time": settings.settle_s,  # an older time belongs to an earlier sample
@@ -154,6 +160,16 @@ class SampleAssembler:
             return f"no message on {', '.join(dict.fromkeys(self._find_topics(*REQUIRED_QUANTITIES)))}{retained}"
         return f"{absent[0]}: no message on {', '.join(self._find_topics(absent[0]))}" if absent else None
 
+    @property
+    def silence_reason(self) -> str:
+        """Reason why no messages arrive any more, with the setting that may help."""
+        return f"no new message on {', '.join(dict.fromkeys(self._find_topics(*REQUIRED_QUANTITIES)))}{self._hint}"
+
+    @property
+    def _hint(self) -> str:
+        """Hint about the setting for a publisher that sends only changes; empty if it is set."""
+        return "" if self._settings.max_silent_s else "; if the publisher sends only changes, set source.max_silent_s"
+
     def wait_s(self, now_s: float) -> float | None:
         """Return the time until a sample is complete without a further message [s]; None if a message is needed."""
         if not self._unused_arrival_s:
@@ -172,10 +188,17 @@ class SampleAssembler:
         if topic == self._availability_topic:
             text = payload.decode("utf-8", "replace").strip()
             self._offline_status = text[:MAX_STATUS_CHARACTERS] if "offline" in text.lower() else ""
+            self._is_online = bool(text) and not self._offline_status
+            if self._is_online:
+                waiting, self._retained = self._retained, {}
+                for retained_topic, retained_payload in waiting.items():
+                    self.add_message(retained_topic, retained_payload, now_s, retained=False)
             return
         bindings = [(binding, match) for binding in self._bindings if (match := binding.pattern.fullmatch(topic))]
-        if retained:
+        if retained and not (self._sends_only_changes and self._is_online):
             self._counters["retained"] += bool(bindings)
+            if bindings and self._sends_only_changes and len(self._retained) < MAX_RETAINED:
+                self._retained[topic] = payload
             return
         has_conflict = False
         for binding, match in bindings:
@@ -214,6 +237,8 @@ class SampleAssembler:
             time_s=self._value("time", now_s),
             voltage_held=voltage_held,
             current_held=current_held,
+            soc=(self._value("soc", now_s) or math.nan) / 100.0,
+            capacity_ah=self._value("capacity", now_s) or math.nan,
         )
 
     def _current_is_old(self) -> bool:
@@ -232,7 +257,9 @@ class SampleAssembler:
             if 1 <= number <= highest and not math.isnan(value):
                 key = (*location, number)
                 messages = self._values[key].messages + 1 if key in self._values else 1
-                self._values[key] = _StoredValue(value, now_s, now_s + self._max_age_s[binding.quantity], messages)
+                lasts = self._sends_only_changes and self._is_online and binding.quantity not in TIMED_QUANTITIES
+                expiry_s = math.inf if lasts else now_s + self._max_age_s[binding.quantity]
+                self._values[key] = _StoredValue(value, now_s, expiry_s, messages)
         if binding.quantity in REQUIRED_QUANTITIES:
             self._unused_arrival_s.setdefault(binding.quantity, now_s)
 
@@ -264,21 +291,32 @@ class SampleAssembler:
         self._conflicts[key] = f"{binding.topic}: {binding.quantity} {detector.text}"
         return True
 
+    @property
+    def _sends_only_changes(self) -> bool:
+        """True if the publisher sends only changes, and reports on a topic whether it is online."""
+        return self._settings.max_silent_s is not None and bool(self._availability_topic)
+
+    def _is_fresh(self, stored: _StoredValue, now_s: float) -> bool:
+        """Return True unless a value is too old. A value without expiry lasts while the publisher is online."""
+        return self._is_online if stored.expiry_s == math.inf else now_s <= stored.expiry_s
+
     def _count_stale(self, name: str) -> None:
         """Count a sample that lacks voltage or current."""
         self._counters["stale"] += 1
         if (name, 0, 1) in self._values:
             topics = ", ".join(self._find_topics(name))
-            self.faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.stale_s:g} s")
+            self.faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.stale_s:g} s{self._hint}")
 
     def _value(self, name: str, now_s: float) -> float | None:
         """Return a value unless it is too old."""
         stored = self._values.get((name, 0, 1))
-        return stored.value if stored and now_s <= stored.expiry_s else None
+        return stored.value if stored and self._is_fresh(stored, now_s) else None
 
     def _cells_v(self, now_s: float) -> list[float]:
         """Return the voltages from cell 1 to the last cell with a recent value [V]; NaN for a cell without one."""
-        cells = {key[2]: each for key, each in self._values.items() if key[0] == "cells" and now_s <= each.expiry_s}
+        cells = {
+            key[2]: each for key, each in self._values.items() if key[0] == "cells" and self._is_fresh(each, now_s)
+        }
         return [cells[number].value if number in cells else math.nan for number in range(1, max(cells, default=0) + 1)]
 
     def _probes_c(self, now_s: float) -> list[float]:
@@ -287,7 +325,7 @@ class SampleAssembler:
         counts = {index: number for _, index, number in probes}  # highest number of a probe by index of the location
         keys = [("temperature", index, i + 1) for index, count in counts.items() for i in range(count)]
         slots = [self._values.get(key) for key in keys]
-        return [slot.value if slot and now_s <= slot.expiry_s else math.nan for slot in slots]
+        return [slot.value if slot and self._is_fresh(slot, now_s) else math.nan for slot in slots]
 
     def _find_topics(self, *quantities: str) -> list[str]:
         return [binding.topic for binding in self._bindings if binding.quantity in quantities]

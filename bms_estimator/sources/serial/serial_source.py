@@ -164,7 +164,10 @@ class SerialSource:
                         self._silence_reason, self._rejected = None, False
                         self._silence_log.on_samples(self._monotonic())
                         self._port.reset_backoff()
-                    yield ReceivedSamples(block, self._decoder.cells, self._decoder.probes)
+                    decoder = self._decoder
+                    yield ReceivedSamples(
+                        block, decoder.cells, decoder.probes, decoder.device_soc, decoder.device_capacity_ah
+                    )
         if self._task is not None and not self._task.cancelled():
             self._task.result()
 

@@ -148,6 +148,14 @@ def test_a_given_curve_and_its_hysteresis_are_used_unchanged():
     assert result.hysteresis_v == pytest.approx(hysteresis_v(NODES), abs=1e-3)
 
 
+def test_a_given_curve_with_a_plateau_has_the_error_of_a_quasi_ocv_unless_its_std_is_given():
+    lfp = load_cell("lfp", CAPACITY_AH).ocv
+    soc, ocv_v, std_v = np.array(lfp.soc), np.array(lfp.ocv_v), np.full(len(lfp.soc), 0.003)
+    for given_v, expected_v in ((None, 0.01), (std_v, 0.003)):
+        points = sources_of(curves=[ExternalCurve("book", soc, ocv_v, None, given_v)], capacity_ah=5.0).points
+        assert points.systematic_std_v == pytest.approx(expected_v)
+
+
 @pytest.mark.parametrize("fraction", [0.4, 1.0])
 def test_rests_determine_the_remaining_fraction_of_the_hysteresis(fraction):
     soc, rests = np.linspace(0.0, 1.0, 101), relaxation()

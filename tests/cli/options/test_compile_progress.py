@@ -8,10 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.options.compile_progress import COMPILE_LABEL, COMPILE_TEXT, show_compile_progress
-from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.numba_cache import count_cached_kernels, count_kernels, njit
-from bms_estimator.service.kernel_warm_up import load_kernels
+from bms_estimator.cli.options.compile_progress import COMPILE_LABEL, COMPILE_TEXT
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 from tests.pseudo_terminal import PseudoTerminal
@@ -49,29 +46,13 @@ def test_first_start_reports_the_compilation_and_can_be_interrupted(command: str
     assert ('"level": "info"' in first) == (command == "run")  # a service logs JSON to a pipe
 
 
-def test_line_is_printed_once_and_only_if_a_kernel_is_compiled() -> None:
-    lines: list[str] = []
-    kernel = njit()(chen_mora.min_stable_exponent.py_func)  # not in the cache
-    with show_compile_progress(lines.append):
-        kernel(0.5, 1.0, 2.0)
-        njit()(chen_mora.delta.py_func)(0.5, 1.0, 2.0)
-    assert lines == [COMPILE_TEXT]
-    with show_compile_progress(lines.append):
-        kernel(0.6, 1.0, 2.0)
-    assert lines == [COMPILE_TEXT]
-
-
-def test_a_terminal_shows_the_fraction_of_the_kernels_that_are_compiled(
+def test_a_terminal_shows_the_number_of_kernels_that_are_compiled_and_the_time_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     table = tmp_path / "table.csv"
     table.write_text("time_s,current_a,voltage_v\n0,0,3.7\n1,0,3.7\n")
     with PseudoTerminal("replay", str(table), "--cell", "ncr18650") as terminal:
-        terminal.until(lambda: re.search(rf"{re.escape(COMPILE_LABEL)}.* [1-9]\d?%", terminal.output) is not None)
-
-
-def test_a_compiled_kernel_counts_as_cached_and_all_kernels_are_counted() -> None:
-    load_kernels()
-    assert count_kernels() > 100
-    assert 0.8 * count_kernels() < count_cached_kernels()
+        terminal.until(
+            lambda: re.search(rf"{COMPILE_LABEL}: [1-9]\d* of \d+ .*\d:\d\d:\d\d", terminal.output) is not None
+        )

@@ -6,7 +6,7 @@ import tomllib
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.cell_file import write_cell
+from bms_estimator.model.pack_model import write_cell
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.factory import KINDS
 from tests.command_line import run

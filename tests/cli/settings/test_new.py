@@ -1,27 +1,35 @@
 """``new``: the wizard finds the device, asks, compares with a multimeter, writes the file and shows the first estimate."""
 
 import asyncio
+import math
 import os
 import re
 import signal
 import subprocess
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
+from threading import Event, Thread
+from urllib.parse import quote
 
 import pytest
 
 from bms_estimator.protocols.firmware.messages import Hello
+from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import load_settings
+from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial.device_detection import BoardClient
 from tests.command_line import PROGRAM, run
 from tests.device_line import running_device
-from tests.mosquitto import Broker, Listener
+from tests.mosquitto import Broker
 from tests.patience import LONG_S
 from tests.pseudo_terminal import PseudoTerminal
 from tests.simavr_board import SimavrBoard, write_readings
 
+PASSWORD = "p@ss:word"
+"""Password with the separators of a URL."""
 ESTIMATE = re.compile(r"SOC [0-9.]+% ± [0-9.]+% \(2 standard deviations\), 26\.66 V, 5\.50 A")
 ANSWERS = {
     "--name": "house",
@@ -31,6 +39,7 @@ ANSWERS = {
     "--parallel": "1",
     "--max-discharge-a": "60",
     "--max-charge-a": "none",
+    "--device-soc-std": "none",
     "--broker": "none",
 }
 """Answers about a pack of eight cells."""
@@ -92,7 +101,8 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
         ("Cells in parallel", "", "Largest discharge current"),
         ("Largest discharge current", "-5", "-5.0: must be greater than 0"),
         ("Largest discharge current", "60 A", "Largest charge current"),
-        ("Largest charge current", "", "MQTT broker"),
+        ("Largest charge current", "", "Standard deviation of the device's SOC"),
+        ("Standard deviation of the device's SOC", "", "MQTT broker"),
         ("MQTT broker", "localhost", "localhost: must be mqtt://host:port"),
         ("MQTT broker", "mqtt://localhost:99999", "mqtt://localhost:99999: Port out of range 0-65535"),
         ("MQTT broker", "none", "pack.toml: written; house: lfp, 8 in series"),
@@ -116,6 +126,7 @@ def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
     settings = load_settings(file)
     assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 40.0, 8)
     assert (settings.pack.max_discharge_a, settings.pack.max_charge_a) == (60.0, None)
+    assert settings.pack.device_soc_std == 0.1
     assert (settings.sensor.port, settings.sensor.protocol, settings.mqtt) == (path, "jk", None)
     assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
 
@@ -165,7 +176,7 @@ def test_the_service_is_installed_with_sudo(file, capsys, long_timeouts, tmp_pat
     ("arguments", "message"),
     [
         (["--no-compare", *options(cell=None)], "--cell: missing, and there is no terminal to ask"),
-        (["--yes", *options(capacity_ah=None)], "--capacity-ah: missing, and there is no default"),
+        (["--yes", *options(cell=None)], "--cell: missing, and there is no default"),
         (options(), "--compare: missing"),
         (["--no-compare", *options(series="4")], "--series 4: the device reports 8 cells in series"),
         (["--no-compare", *options(broker="ftp://x")], "--broker ftp://x: must be mqtt://host:port"),
@@ -257,27 +268,78 @@ def read_hello(path: str) -> Hello:
         return client.hello()
 
 
-async def wait_for_node(broker: Broker) -> None:
-    async with Listener(broker) as listener:
-        await listener.wait("jk-bms/sensor/jk-bms_temperature_sensor_1/state")
+@pytest.fixture
+def closed_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Broker with a password, as that of Home Assistant. A simulated ESPHome node publishes there."""
+    passwords = tmp_path / "passwords"
+    subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "owner", PASSWORD], check=True, capture_output=True)
+    passwords.chmod(0o644)
+    broker = Broker(tmp_path, f"allow_anonymous false\npassword_file {passwords}").start()
+    (tmp_path / "node-password").write_text(PASSWORD)
+    mqtt = MqttSettings(url=broker.url, username="owner", password_file=tmp_path / "node-password")
+    node = SimulatedNode(lambda _: Reading(5.0, 52.8, 21.0), cells=16, mqtt=mqtt, speed=10.0)
+    stop = Event()
+    thread = Thread(target=lambda: asyncio.run(publish_until(node, stop)))
+    thread.start()
+    yield broker
+    stop.set()
+    thread.join()
+    broker.stop()
+
+
+async def publish_until(node: SimulatedNode, stop: Event) -> None:
+    publishing = asyncio.create_task(node.run(math.inf))
+    await asyncio.to_thread(stop.wait)
+    publishing.cancel()
+    await asyncio.gather(publishing, return_exceptions=True)
+
+
+def check_settings_with_login(file: Path, broker: Broker) -> None:
+    """Check that source and service use the broker with the password, which only its owner can read."""
+    settings = tomllib.loads(file.read_text())
+    assert settings["source"] == {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms"}
+    assert settings["mqtt"] == {"url": broker.url, "username": "owner", "password_file": "house-mqtt.password"}
+    assert settings["pack"]["series"] == 16
+    password = file.with_name("house-mqtt.password")
+    assert password.read_text() == PASSWORD
+    assert password.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_publisher_at_a_broker_with_a_password_is_found_with_its_values(
+    closed_broker, file, capsys, long_timeouts, monkeypatch
+):
+    monkeypatch.setattr("bms_estimator.setup.search.LISTEN_S", 2.0)
+    place = closed_broker.url.replace("://", f"://owner:{quote(PASSWORD, safe='')}@")
+    answers = options(series=None, parallel=None, broker=None)
+    code, out, err = run(capsys, "new", file, "--search", place, *answers, "--yes", "--no-estimate")
+    assert (code, err) == (0, "")
+    assert re.search(rf"1  esphome-jk:jk-bms: .*{closed_broker.url}; 5\d\.\d\d V, ", out)
+    assert PASSWORD not in out
+    check_settings_with_login(file, closed_broker)
 
 
 @pytest.mark.thorough
-def test_a_publisher_at_the_broker_is_found_with_its_values(broker, file):
-    simulated = [PROGRAM, "simulate", "--mqtt", broker.url, "--cell", "lfp", "--capacity-ah", "100", "--series", "16"]
-    answers = options(series=None, parallel=None, broker=None)
-    with subprocess.Popen(simulated, stdout=subprocess.DEVNULL) as node:
-        try:
-            asyncio.run(wait_for_node(broker))
-            command = [PROGRAM, "new", str(file), "--search", broker.url, *answers, "--yes", "--no-estimate"]
-            found = subprocess.run(command, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
-        finally:
-            node.terminate()
-    assert re.search(rf"^1  esphome-jk:jk-bms: .*{broker.url}; 5\d\.\d\d V, ", found.stdout)
-    written = tomllib.loads(file.read_text())
-    assert written["source"] == {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms"}
-    assert written["mqtt"] == {"url": broker.url}
-    assert written["pack"]["series"] == 16
+def test_wizard_asks_for_the_password_of_a_broker_until_it_is_right(closed_broker, file):
+    dialog = [
+        ("User name at", "owner"),
+        ("Password", "wrong"),
+        ("User name at", "owner"),
+        ("Password", PASSWORD),
+        ("Number of the device", ""),
+        ("Compare the device", "n"),
+        ("Cells in series", ""),
+        ("MQTT broker", ""),
+        ("Install the service", "n"),
+    ]
+    command = ("new", str(file), "--search", closed_broker.url, "--no-estimate", *options(series=None, broker=None))
+    with PseudoTerminal(*command, columns=200) as terminal:
+        for question, answer in dialog:
+            terminal.until(lambda question=question: re.search(f"{question}[^\n]*[:?] $", plain(terminal.output)))
+            shown, terminal.output = terminal.output, ""
+            assert PASSWORD not in shown
+            terminal.press(f"{answer}\r".encode())
+        terminal.until(terminal.ended)
+    check_settings_with_login(file, closed_broker)
 
 
 @pytest.mark.usefixtures("firmware")

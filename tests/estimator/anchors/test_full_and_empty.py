@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.anchor_settings import between_limits
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.payloads.health import AnchorReport
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.settings.charge_limits import ChargeLimits
+from bms_estimator.settings.sampling import NO_LIMITS, ChargeLimits
 from bms_estimator.sources.captures.replay import load_capture
 from bms_estimator.telemetry.health import identifier_counters, last_anchor
 from tests.estimator.anywhere.cases import OXIDE
@@ -89,18 +91,43 @@ def test_live_samples_and_blocks_have_equal_anchors() -> None:
     assert of_block.record.tobytes() == of_samples.record.tobytes()
 
 
-def test_an_end_of_charge_that_contradicts_the_ocv_curve_is_reported_and_corrects_nothing() -> None:
-    """The charger ends at 4.1 V, where the curve of the cell file has SOC 0.92."""
-    current_a = np.r_[np.zeros(60), np.full(3600, -0.06 * CAPACITY_AH), np.zeros(600)]
+def charge_to_4_1_v(cell: CellModel) -> AnchorReport:
+    """Return the anchor after the end of a charge to 4.1 V."""
+    current_a = np.r_[np.zeros(60), np.full(3600, -0.06 * cell.cell.capacity_ah), np.zeros(600)]
     samples = np.zeros(current_a.size, dtype=SAMPLE)
     samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
     samples["voltage_v"] = np.where(current_a < 0.0, 4.1, 4.09)
-    estimator = Estimator(load_cell("nmc", CAPACITY_AH), limits=ChargeLimits(full_voltage_v=4.1))
+    estimator = Estimator(cell, limits=ChargeLimits(full_voltage_v=4.1))
     estimator.run(samples)
     anchor = last_anchor(estimator.record[0])
     assert anchor is not None
     assert anchor.kind == "full"
+    return anchor
+
+
+def test_an_end_of_charge_that_contradicts_a_measured_curve_is_reported_and_corrects_nothing() -> None:
+    """The charger ends at 4.1 V, where the curve of the cell file has SOC 0.92."""
+    anchor = charge_to_4_1_v(load_cell("ncr18650"))
     assert anchor.soc_after == anchor.soc_before == pytest.approx(0.92, abs=0.03)
+
+
+def test_a_generic_curve_is_full_where_the_charger_ends() -> None:
+    assert charge_to_4_1_v(load_cell("nmc", CAPACITY_AH)).soc_after == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_generic_curve_lies_between_the_voltages_of_protection_and_charger() -> None:
+    generic, limits = load_cell("nmc", CAPACITY_AH), ChargeLimits(full_voltage_v=4.1, cutoff_voltage_v=3.3)
+    p, whole = (Estimator(generic, limits=each).cell_file_settings for each in (limits, NO_LIMITS))
+    assert p["ocv_v"][[0, -1]] == pytest.approx([3.3, 4.1], abs=2e-3)
+    soc = np.linspace(0.0, 1.0, p["ocv_v"].size)
+    low, high = np.interp([3.3, 4.1], whole["ocv_v"], soc)
+    assert p["ocv_v"] == pytest.approx(np.interp(low + (high - low) * soc, soc, whole["ocv_v"]), abs=3e-3)
+    assert p["capacity_as"] == whole["capacity_as"]
+
+
+def test_voltages_of_another_pack_leave_a_generic_curve_unchanged() -> None:
+    generic = load_cell("nmc", CAPACITY_AH)
+    assert between_limits(generic, ChargeLimits(full_voltage_v=3.5)) is generic
 
 
 @pytest.mark.parametrize(("gap_s", "anchors"), [(7200.0, 1), (20.0, 0)])

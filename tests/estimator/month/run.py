@@ -10,9 +10,9 @@ from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack.pack import Pack
+from bms_estimator.pack_model.accuracy import bound
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.learning import SlowFit
-from tests.benchmarks.observability import bound, curves
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.use import DAY_S
 from tests.estimator.month.cases import Case
@@ -41,7 +41,7 @@ class Day:
     """Std of the learned capacity divided by the true capacity."""
     bound: float
     """Lower bound of the std of the SOC, as a mean over the window of SOCs that was passed until the end of the day
-    (``tests.benchmarks.observability``)."""
+    (``bms_estimator.pack_model.accuracy``)."""
 
 
 def run(case: Case, data: Path) -> list[Day]:
@@ -51,7 +51,7 @@ def run(case: Case, data: Path) -> list[Day]:
     estimator = Estimator(recording.cell, voltage_resolution_v=case.source.volt_step, sampling=case.source.sampling)
     slow_fit = SlowFit(estimator, interval_s=DAY_S)
     results: list[Day] = []
-    cell = curves(recording.cell)
+    cell = CellCurves(estimator.cell_file_settings)
     for number in range(case.days):
         begin, end = np.searchsorted(samples["time_s"], (number * DAY_S, (number + 1) * DAY_S))
         if begin == end:

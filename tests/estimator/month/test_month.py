@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.estimator import Estimator
 from bms_estimator.model.sample import SampleStatus
-from tests.benchmarks.observability import curves
+from bms_estimator.pack_model.cell_curves import CellCurves
 from tests.conftest import SHARED_DATA
 from tests.estimator.anywhere.truth import rest_state, simulate, simulate_from
 from tests.estimator.anywhere.use import DAY_S
@@ -149,7 +150,7 @@ def test_a_run_is_scored_day_by_day_and_repeats_exactly() -> None:
 
 def test_only_a_full_charge_that_is_seen_lowers_the_bound() -> None:
     recording = draw(replace(TWO_DAYS, use="bicycle"))
-    cell = curves(recording.cell)
+    cell = CellCurves(Estimator(recording.cell).cell_file_settings)
     assert recording.truth["soc"].max() > FULL_SOC
     unseen, seen = (bound_of(replace(TWO_DAYS, use=use), cell, recording.truth) for use in ("bicycle", "full_nightly"))
     assert seen < 0.9 * unseen

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell_model.chen_mora import ocv
-from bms_estimator.kernels.cell_model.open_loop import branch_currents
-from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.sampling import Sampling
-from tests.estimator.simulated_cell import TRUTH, measured
+from tests.estimator.simulated_cell import TRUTH, measured, simulate_file
 
 HOUR = 3600
 FROZEN_SAMPLES = slice(HOUR, 3 * HOUR)
@@ -89,23 +86,15 @@ def test_the_soc_is_corrected_once_a_current_sensor_that_reports_zero_is_detecte
     assert (np.abs(soc - true_soc)[is_reported] < 2.0 * std[is_reported]).all()
 
 
+PARKED_AH = 60.0
+"""Capacity of the cells of a parked car [Ah]."""
 LFP_AH = 2.3
 """Capacity of the LFP cell [Ah], and its current of 1 C [A]."""
 
 
 def simulate_lfp(current_a: np.ndarray, soc: float) -> SampleBlock:
     """Return samples of the generic LFP cell from rest at ``soc``, with a resolution of 1 mV."""
-    p = Estimator(load_cell("lfp", LFP_AH)).settings_record[0]["filter"]
-    samples = np.zeros(current_a.size, dtype=SAMPLE)
-    samples["time_s"], samples["current_a"], samples["temperature_c"] = np.arange(current_a.size), current_a, 25.0
-    true_soc = soc - np.cumsum(current_a) / p["capacity_as"]
-    ohm = p["weak_ohm"] + p["strong_ohm"]
-    grid = np.linspace(0.0, 1.0, ohm.shape[0])
-    currents_a = np.column_stack([current_a, branch_currents(samples["time_s"], current_a)])
-    voltage_drop_v = sum(np.interp(true_soc, grid, ohm[:, k]) * currents_a[:, k] for k in range(1 + BRANCHES))
-    ocv_v = np.array([ocv(x, p["ocv_v"], p["ocv_slope_v"]) for x in true_soc])
-    samples["voltage_v"] = np.round(ocv_v - voltage_drop_v, 3)
-    return samples
+    return simulate_file(load_cell("lfp", LFP_AH), current_a, soc)[0]
 
 
 @pytest.mark.parametrize(
@@ -136,4 +125,15 @@ def test_a_coarse_voltage_with_a_configured_resolution_is_not_frozen() -> None:
     samples["voltage_v"] = np.round(samples["voltage_v"], 1)
     estimator = Estimator(TRUTH, initial_soc=0.8, voltage_resolution_v=0.1)
     _, _, suspects = run(estimator, samples)
+    assert not (suspects & FROZEN_FAULTS).any()
+
+
+@pytest.mark.parametrize("current_a", [0.0, 0.3], ids=["exactly 0 A", "constant offset"])
+def test_a_noisy_voltage_of_a_parked_pack_is_no_frozen_current(current_a: float) -> None:
+    """The converter's noise exceeds the change of the voltage that proves a frozen current. It has no other cause than noise."""
+    driven_a = load_a(1200, (0.0, 10.0, 20.0))
+    samples, _ = simulate_file(load_cell("nmc", PARKED_AH), np.r_[driven_a, np.full(6 * HOUR, current_a)], 0.8)
+    samples = samples[::5]
+    samples["voltage_v"] += np.random.default_rng(1).normal(0.0, 0.013, samples.size)
+    _, _, suspects = run(Estimator(load_cell("nmc", PARKED_AH), initial_soc=0.8, sampling=Sampling(5.0)), samples)
     assert not (suspects & FROZEN_FAULTS).any()

@@ -10,7 +10,7 @@ from bms_estimator.edge.subjects import PACKS_BUCKET
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.cell_file import cell_text
+from bms_estimator.model.pack_model import cell_text
 from tests.command_line import run
 from tests.fleet.nats_cluster import running
 from tests.free_port import free_port

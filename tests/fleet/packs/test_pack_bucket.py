@@ -18,7 +18,7 @@ from bms_estimator.fleet.packs.pack_bucket import (
 )
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.cell_file import cell_text
+from bms_estimator.model.pack_model import cell_text
 from tests.fleet.nats_cluster import connected, running
 from tests.patience import LONG_S
 

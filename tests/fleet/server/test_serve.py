@@ -21,7 +21,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import NoAnswerError
-from bms_estimator.fleet.server import credentials, tenant_streams, tenant_watch
+from bms_estimator.fleet.server import credentials, nats_server, tenant_streams, tenant_watch
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_server import serve as serve_node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
@@ -33,6 +33,7 @@ from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSe
 from tests.command_line import run
 from tests.fleet.serve_process import ServeProcess
 from tests.free_port import free_port
+from tests.full_disk import small_disk
 from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S, until
 
@@ -229,6 +230,31 @@ async def test_server_logs_a_warning_when_unsaved_blocks_fill_half_of_the_stream
     assert not task.done()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_server_stores_again_after_its_disk_was_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(nats_server, "HEALTH_S", 0.2)
+    ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
+    settings = ServerSettings(**ports, partitions=1, packs=1, outage_days=0.01, disk_gb=0.29)
+    lines: list[str] = []
+    with small_disk(tmp_path / "disk", "300m") as disk, capture_logs() as logs:
+        spec = ServerSpec(FleetSettings(server=settings))
+        task = asyncio.create_task(serve_node(NodeLocation(disk / "state"), lambda: spec, lines.append))
+        await until(lambda: any("streams ready" in line for line in lines) or task.done())
+        async with await nats.connect(f"nats://{ports['listen']}") as nc:
+            filler = disk / "filler"
+            with contextlib.suppress(OSError), filler.open("wb") as file:
+                while True:
+                    file.write(bytes(1 << 20))
+            await nc.publish(subjects.raw("a"), bytes(200_000))
+            await until(lambda: any(line["event"].startswith("the disk is full") for line in logs))
+            filler.unlink()
+            await until(lambda: sum("streams ready" in line for line in lines) == 2)
+        async with await nats.connect(f"nats://{ports['listen']}") as nc:
+            await nc.jetstream(timeout=LONG_S).publish(subjects.raw("a"), b"stored again")
+        assert not task.done()
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_three_nodes_form_a_cluster_whose_streams_have_three_replicas(

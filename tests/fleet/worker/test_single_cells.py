@@ -21,7 +21,7 @@ from bms_estimator.pack.pack import assemble
 from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
-from bms_estimator.telemetry.charge_energy import ChargeEnergy, ChargeEnergyMeter
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.publish_window import Window
 from bms_estimator.telemetry.state import NAMES, make_state_payload
 from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah

@@ -8,8 +8,10 @@ from contextlib import asynccontextmanager
 import nats
 import pytest
 
+from bms_estimator.cli.fleet import status as status_command
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
+from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.process.tasks import end
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, running
@@ -71,6 +73,43 @@ async def test_clock_errors_are_listed_with_their_packs(cluster, capsys) -> None
     assert "is 375 days, 0:00:00 behind" in lines[0]
     assert "is 2:00:00 ahead" in lines[1]
     assert lines[2] == "w: 1 more pack with a wrong clock"
+
+
+async def test_trouble_of_a_worker_and_unknown_packs_that_send_are_listed(cluster, capsys) -> None:
+    heartbeat = Heartbeat(id="w", started_s=1.79e9, trouble="no space", unknown=("x", "y"), unknown_count=5)
+    async with sending(cluster.url, heartbeat.model_dump_json().encode()):
+        code, out, _ = await status(capsys, cluster.url)
+    assert code == 0
+    lines = out.splitlines()
+    assert "w: no space" in lines
+    assert [line.partition(":")[0] for line in lines if "unknown pack that sends blocks" in line] == ["x", "y"]
+    assert "w: 3 more unknown packs" in lines
+
+
+async def test_wrong_clock_of_the_server_is_named_instead_of_all_edges(cluster, capsys) -> None:
+    errors = {f"p{n}": -1e8 for n in range(4)}
+    heartbeat = Heartbeat(id="w", started_s=1.79e9, packs=5, clock_error_count=4, clock_errors=errors)
+    async with sending(cluster.url, heartbeat.model_dump_json().encode()):
+        _, out, _ = await status(capsys, cluster.url)
+    assert "w: the clocks of 4 edges of 5 differ from the server's: check the clocks of its nodes" in out.splitlines()
+
+
+async def test_one_node_of_three_is_the_reason_why_streams_cannot_be_read(tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(status_command, "STREAMS_S", 2.0)
+    heartbeat = Heartbeat(id="w", started_s=1.79e9)
+    with running(tmp_path, 3, partitions=2) as cluster:
+        async with await nats.connect(cluster.url) as nc:
+            await make_streams(nc, partitions=2, replicas=3)
+        cluster.kill(0)
+        cluster.kill(1)
+        url = cluster.urls[2]
+        async with sending(url, heartbeat.model_dump_json().encode()):
+            code, out, _ = await status(capsys, url)
+    assert code == 0
+    assert any(line.split()[:1] == ["w"] for line in out.splitlines())
+    assert "the streams cannot be read" in out
+    assert "are most nodes up?" in out
+    assert "was it started by `fleet serve`" not in out
 
 
 async def test_unreadable_heartbeat_is_reported_and_the_others_are_listed(cluster, capsys) -> None:

@@ -1,6 +1,7 @@
 """Home Assistant: discovery messages, and rates and delays of published values."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -195,12 +196,8 @@ def test_only_alarms_and_signed_values_have_attributes() -> None:
     for component in COMPONENTS.values():
         assert not component["state_topic"].endswith(("/health", "/state", "/parameters"))
         if "json_attributes_template" in component:
-            assert set(component["json_attributes_template"].split("'")[1::2]) <= {
-                "reason",
-                "severity",
-                "positive",
-                "discharge",
-            }
+            names = set(re.findall(r"'(\w+)':", component["json_attributes_template"]))
+            assert names <= {"reason", "severity", "positive", "hint"}
 
 
 def test_observer_values_are_disabled_by_default() -> None:
@@ -216,7 +213,7 @@ def test_observer_values_are_disabled_by_default() -> None:
     }
     assert not ENABLED_BY_DEFAULT & observer_values
     assert observer_values < set(COMPONENTS)
-    assert {"voltage_v", "current_a", "soc_percent", "time_to_cutoff_h", "r_s_ohm"} <= ENABLED_BY_DEFAULT
+    assert {"voltage_v", "current_a", "soc_percent", "time_to_cutoff_h", "r_s_mohm"} <= ENABLED_BY_DEFAULT
 
 
 def test_discovery_describes_every_entity_with_both_availabilities() -> None:
@@ -228,7 +225,7 @@ def test_discovery_describes_every_entity_with_both_availabilities() -> None:
     soc, current = COMPONENTS["soc_percent"], COMPONENTS["current_a"]
     assert (soc["device_class"], soc["unit_of_measurement"], soc["expire_after"]) == ("battery", "%", 30)
     assert "'positive': 'discharge'" in current["json_attributes_template"]
-    assert "device_class" not in COMPONENTS["r_s_ohm"]
+    assert "device_class" not in COMPONENTS["r_s_mohm"]
     assert len({component["unique_id"] for component in COMPONENTS.values()}) == len(COMPONENTS)
 
 
@@ -292,6 +289,7 @@ def test_entities_of_an_earlier_configuration_are_removed() -> None:
     removed = {key: c["platform"] for key, c in message["components"].items() if key not in components_of(message)}
     assert removed == {
         "alarm_soc_low": "binary_sensor",
+        "r_s_ohm": "sensor",
         "current_zero": "button",
         "acknowledge_alarm": "button",
         "publish_rate": "number",

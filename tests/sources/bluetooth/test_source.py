@@ -47,9 +47,17 @@ def test_current_of_a_reading_is_positive_on_charge() -> None:
     reading = convert_sample(JBD)
     assert reading is not None
     expected = Reading(
-        voltage_v=15.6, current_a=-2.87, temperatures_c=(22.133,), cells_v=(3.43, 3.425, 3.432, 3.417), time_s=0.0
+        voltage_v=15.6,
+        current_a=-2.87,
+        temperatures_c=(22.133,),
+        cells_v=(3.43, 3.425, 3.432, 3.417),
+        time_s=0.0,
+        soc=1.0,
+        remaining_ah=0.0,
+        capacity_ah=0.0,
     )
-    assert reading._replace(time_s=0.0) == expected  # without a timestamp, time_s is NaN
+    # NaN in place of a value that is not reported
+    assert reading._replace(time_s=0.0, remaining_ah=0.0, capacity_ah=0.0) == expected
     settings = Settings.model_validate({"source": {"kind": "ble", "name": "DP04S007L4S100A"}})
     assert settings.sensor.current_sign == "charge_positive"
 

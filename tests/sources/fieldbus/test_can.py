@@ -70,7 +70,7 @@ async def test_of_several_frames_only_the_valid_one_with_the_identifier_of_the_p
             PYLONTECH_FRAME,
         ):
             sender.send(message)
-        assert json.loads(await next_line(lines)) == PYLONTECH_SAMPLE
+        assert json.loads(await next_line(lines)) == PYLONTECH_SAMPLE | {"device_soc": 1.0}
     assert producer.counters == {"short_frames": 1, "not_measured": 0, "error_frames": 0, "junk": 0}
 
 

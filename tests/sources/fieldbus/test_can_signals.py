@@ -91,12 +91,13 @@ def test_only_the_frame_of_the_profile_is_decoded() -> None:
     resolutions = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
     assert source_settings.sensor_defaults == {"current_sign": "charge_positive", **resolutions}
     can_map = CanDecoder(source_settings)
-    assert can_map.frame_ids == (FrameId(0x356, False),)
+    assert can_map.frame_ids == (FrameId(0x356, False), FrameId(0x355, False))
     assert can_map.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
-    assert can_map.feed(0.0, 0x355, extended=False, data=bytes(4)) is None
+    assert can_map.feed(0.0, 0x355, extended=False, data=bytes([62, 0, 99, 0])) is None
     reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA)
     assert reading is not None
     assert reading[:4] == (52.34, -12.3, (21.5,), ())
+    assert reading.soc == 0.62
 
 
 def test_truncated_frame_gives_the_values_that_it_contains() -> None:

@@ -31,7 +31,7 @@ def source(**options: object) -> ModbusSource:
 
 def victron_registers() -> Registers:
     """Return the registers of a GX device that measures 52.34 V, 12.3 A of discharge and 21.5 degC."""
-    return Registers({259: 5234, 260: 1200, 261: 0x10000 - 123, 262: 215})  # 260 is not read; 261 is negative
+    return Registers({259: 5234, 261: 0x10000 - 123, 262: 215, 266: 620} | dict.fromkeys((260, 263, 264, 265), 0))
 
 
 async def read_lines(producer: ModbusProducer, count: int) -> list[dict[str, object]]:
@@ -52,18 +52,34 @@ async def test_device_with_a_profile_is_read_over_tcp_in_one_request() -> None:
     registers, port = victron_registers(), free_port()
     producer = ModbusProducer(source(profile="victron-gx", host="127.0.0.1", tcp_port=port))
     async with tcp_device(registers, UNIT, port):
-        assert await read_lines(producer, 3) == 3 * [{"voltage_v": 52.34, "current_a": -12.3, "temperature_c": 21.5}]
-    assert set(registers.requests) == {(3, 259, 4)}
+        assert await read_lines(producer, 3) == 3 * [
+            {"voltage_v": 52.34, "current_a": -12.3, "temperature_c": 21.5, "device_soc": 0.62}
+        ]
+    assert set(registers.requests) == {(3, 259, 8)}
     assert not any(producer.counters.values())
 
 
 async def test_device_with_a_profile_is_read_over_a_serial_line(tmp_path: Path) -> None:
     registers = Registers(input_={0x1000 + i: 0 for i in range(17)} | {0x1100 + i: 3300 + i for i in range(26)})
-    registers.input |= {0x1000: 5320, 0x1001: 150, 0x1009: 2981, 0x100C: 3000, 0x100D: 2971}
+    registers.input |= {
+        0x1000: 5320,
+        0x1001: 150,
+        0x1003: 28_000,
+        0x1005: 620,
+        0x1009: 2981,
+        0x100C: 3000,
+        0x100D: 2971,
+    }
     async with serial_device(registers, UNIT, tmp_path) as path:
         (line,) = await read_lines(ModbusProducer(source(profile="seplos-v3", unit=UNIT, port=str(path))), 1)
     assert line.pop("cells_v") == [round(3.3 + i / 1000, 3) for i in range(16)]
-    assert line == {"voltage_v": 53.2, "current_a": 1.5, "temperatures_c": [24.95, 26.85, 23.95]}
+    assert line == {
+        "voltage_v": 53.2,
+        "current_a": 1.5,
+        "temperatures_c": [24.95, 26.85, 23.95],
+        "device_soc": 0.62,
+        "device_capacity_ah": 280.0,
+    }
     assert set(registers.requests) == {(4, 0x1000, 14), (4, 0x1100, 16)}
 
 
@@ -80,10 +96,11 @@ async def test_missing_register_of_the_temperature_is_omitted_and_of_the_current
     source_settings = source(profile="victron-gx", host="127.0.0.1", tcp_port=port)
     async with tcp_device(registers, UNIT, port):
         producer = ModbusProducer(source_settings)
-        assert await read_lines(producer, 2) == 2 * [{"voltage_v": 52.34, "current_a": -12.3}]
+        assert await read_lines(producer, 2) == 2 * [{"voltage_v": 52.34, "current_a": -12.3, "device_soc": 0.62}]
         assert producer.counters["refused"] == 2
+        values = [(3, 259, 1), (3, 261, 1), (3, 262, 1), (3, 266, 1)]
         # the rejected request of all registers is split into one for each value; afterwards the temperature is left out
-        assert registers.requests == [(3, 259, 4), (3, 259, 1), (3, 261, 1), (3, 262, 1), (3, 259, 1), (3, 261, 1)]
+        assert registers.requests == [(3, 259, 8), *values, *(value for value in values if value[1] != 262)]
         del registers.holding[261]
         reason = await failure_reason(ModbusProducer(source_settings))
     assert reason == "source.current (holding register 261): illegal data address: the device has no such register"
@@ -103,8 +120,8 @@ async def test_wrong_unit_on_a_serial_line_is_reported_as_a_timeout(tmp_path: Pa
         source_settings = source(profile="victron-gx", unit=9, port=str(path), timeout_s=0.2)
         reason = await failure_reason(ModbusProducer(source_settings))
     assert reason == (
-        "no response within 0.2 s to a request of source.voltage, source.current, source.temperature"
-        " (holding registers 259 to 262)"
+        "no response within 0.2 s to a request of source.voltage, source.current, source.temperature, source.soc"
+        " (holding registers 259 to 266)"
     )
 
 

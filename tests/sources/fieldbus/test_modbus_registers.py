@@ -78,15 +78,18 @@ def test_requests_cover_every_register_once_within_the_maximum_length(registers:
 
 def test_device_with_a_profile_is_read_in_as_few_requests_as_possible() -> None:
     (request,) = plan_requests(list_values(source(profile="victron-gx")))
-    assert (request.table, request.address, request.words) == ("holding", 259, 4)
-    assert request.described == "source.voltage, source.current, source.temperature (holding registers 259 to 262)"
+    assert (request.table, request.address, request.words) == ("holding", 259, 8)
+    assert (
+        request.described
+        == "source.voltage, source.current, source.temperature, source.soc (holding registers 259 to 266)"
+    )
     seplos = plan_requests(list_values(source(profile="seplos-v3")))
     assert [(r.table, r.address, r.words) for r in seplos] == [("input", 0x1000, 14), ("input", 0x1100, 16)]
 
 
 def test_rejected_request_is_split_by_quantity_and_without_gaps() -> None:
     (request,) = plan_requests(list_values(source(profile="victron-gx")))
-    assert [(r.address, r.words) for r in split_request(request)] == [(259, 1), (261, 1), (262, 1)]
+    assert [(r.address, r.words) for r in split_request(request)] == [(259, 1), (261, 1), (262, 1), (266, 1)]
     single_value_request = split_request(request)[0]
     assert split_request(single_value_request) == (single_value_request,)
 

@@ -59,7 +59,14 @@ def esphome(node: str, voltage: str, current: str, temperature: str, cell: str, 
         empty_slots: Number of cell sensors without a cell, which are 0 V.
     """
     cells = [(cell.format(n), f"3.3{n:02}" if n <= 16 else "0.000") for n in range(1, 17 + empty_slots)]
-    values = [*cells, (temperature, "21.5"), (voltage, "52.98"), (current, "-12.34"), ("balancing_current", "0.000")]
+    values = [
+        *cells,
+        (temperature, "21.5"),
+        ("state_of_charge", "62"),
+        (voltage, "52.98"),
+        (current, "-12.34"),
+        ("balancing_current", "0.000"),
+    ]
     return [(f"{node}/sensor/{node}_{name}/state", value) for name, value in values]
 
 
@@ -84,13 +91,25 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
     "esphome-jk": (
         {"profile": "esphome-jk", "prefix": "jk-bms"},
         esphome("jk-bms", "total_voltage", "current", "temperature_sensor_1", "cell_voltage_{}"),
-        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN_CELLS_V},
+        {
+            "voltage_v": 52.98,
+            "current_a": -12.34,
+            "temperature_c": 21.5,
+            "device_soc": 0.62,
+            "cells_v": SIXTEEN_CELLS_V,
+        },
         "charge_positive",
     ),
     "esphome-jbd": (
         {"profile": "esphome-jbd", "prefix": "jbd-bms-ble"},
         esphome("jbd-bms-ble", "total_voltage", "current", "temperature_1", "cell_voltage_{}"),
-        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": SIXTEEN_CELLS_V},
+        {
+            "voltage_v": 52.98,
+            "current_a": -12.34,
+            "temperature_c": 21.5,
+            "device_soc": 0.62,
+            "cells_v": SIXTEEN_CELLS_V,
+        },
         "charge_positive",
     ),
     "esphome-daly": (
@@ -108,11 +127,20 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
         [
             ("N/c0619ab12345/battery/1/Voltages/Cell1", '{"value":3.301}'),
             ("N/c0619ab12345/battery/1/Dc/0/Temperature", '{"value":21.5}'),
+            ("N/c0619ab12345/battery/1/Soc", '{"value":80}'),
+            ("N/c0619ab12345/battery/1/InstalledCapacity", '{"value":280}'),
             ("N/c0619ab12345/battery/1/Dc/0/Voltage", '{"value":52.98}'),
             ("N/c0619ab12345/battery/1/Dc/0/Current", '{"value":-12.34}'),
             ("N/c0619ab12345/battery/2/Dc/0/Current", '{"value":-99.0}'),
         ],
-        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.5, "cells_v": [3.301]},
+        {
+            "voltage_v": 52.98,
+            "current_a": -12.34,
+            "temperature_c": 21.5,
+            "cells_v": [3.301],
+            "device_soc": 0.8,
+            "device_capacity_ah": 280.0,
+        },
         "charge_positive",
     ),
     "battery-emulator": (
@@ -121,10 +149,16 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
             ("BE/spec_data", '{"cell_voltages":[3.701,3.702,3.700],"cell_balancing":[false,false,true]}'),
             (
                 "BE/info",
-                '{"bms_status":"ACTIVE","SOC":81.5,"temperature_max":21.5,"temperature_min":20.5,"battery_current":-12.3,"battery_voltage":355.2}',
+                '{"bms_status":"ACTIVE","SOC":81.5,"SOC_real":80.5,"temperature_max":21.5,"temperature_min":20.5,"battery_current":-12.3,"battery_voltage":355.2}',
             ),
         ],
-        {"voltage_v": 355.2, "current_a": -12.3, "temperatures_c": [21.5, 20.5], "cells_v": [3.701, 3.702, 3.7]},
+        {
+            "voltage_v": 355.2,
+            "current_a": -12.3,
+            "temperatures_c": [21.5, 20.5],
+            "cells_v": [3.701, 3.702, 3.7],
+            "device_soc": 0.805,
+        },
         "charge_positive",
     ),
     "opendtu": (
@@ -133,10 +167,11 @@ PROJECTS: dict[str, tuple[dict[str, Any], Messages, dict[str, Any], str]] = {
             ("solar/battery/BatteryTempOneCelsius", "21"),
             ("solar/battery/Cell1MilliVolt", "3301"),
             ("solar/battery/CellMinMilliVolt", "3301"),
+            ("solar/battery/stateOfCharge", "62"),
             ("solar/battery/voltage", "52.98"),
             ("solar/battery/current", "-12.34"),
         ],
-        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.0, "cells_v": [3.301]},
+        {"voltage_v": 52.98, "current_a": -12.34, "temperature_c": 21.0, "device_soc": 0.62, "cells_v": [3.301]},
         "charge_positive",
     ),
     "tasmota": (
@@ -241,7 +276,10 @@ def test_value_of_a_silent_topic_is_used_up_to_the_maximum_age() -> None:
     assert assembler.wait_s(20.5) is None
     assert feed(assembler, [("i", "3")], 40.0) == []
     assert assembler.counters["stale"] == 2
-    assert assembler.fault == "voltage: no message on v for 30 s"
+    assert (
+        assembler.fault
+        == "voltage: no message on v for 30 s; if the publisher sends only changes, set source.max_silent_s"
+    )
     assert feed(assembler, [("v", "50")], 40.4) == [{"voltage_v": 50.0, "current_a": 3.0}]
     assert assembler.fault is None
 
@@ -320,6 +358,34 @@ def test_temperature_is_used_for_five_minutes() -> None:
     feed(assembler, [("t", "21.5")])
     assert feed(assembler, voltage_and_current, 299.0)[0]["temperature_c"] == 21.5
     assert "temperature_c" not in feed(assembler, voltage_and_current, 301.0)[0]
+
+
+def test_retained_and_constant_values_count_while_a_publisher_of_changes_is_online() -> None:
+    assembler = SampleAssembler(
+        json_source(
+            temperature={"topic": "home/probe"},
+            soc={"topic": "home/soc"},
+            availability_topic="home/status",
+            max_silent_s=600,
+        )
+    )
+    state = [("home/pack", '{"u": 52, "i": 1}'), ("home/probe", "21"), ("home/soc", "62")]
+    assert feed(assembler, state, retained=True) == []
+    (sample,) = feed(assembler, [("home/status", "online")], 1.0, retained=True)
+    assert (sample["temperature_c"], sample["device_soc"]) == (21.0, 0.62)
+    (sample,) = feed(assembler, [("home/pack", '{"u": 51, "i": 2}')], 500.0)
+    assert (sample["temperature_c"], sample["device_soc"]) == (21.0, 0.62)
+    feed(assembler, [("home/status", "offline")], 501.0)
+    (sample,) = feed(assembler, [("home/pack", '{"u": 51, "i": 2}')], 502.0)
+    assert "temperature_c" not in sample
+
+
+def test_the_reason_for_missing_messages_names_the_setting_of_a_publisher_of_changes() -> None:
+    assembler = SampleAssembler(json_source())
+    feed(assembler, [("home/pack", '{"u": 52, "i": 1}')])
+    assert assembler.silence_reason == (
+        "no new message on home/pack; if the publisher sends only changes, set source.max_silent_s"
+    )
 
 
 def test_retained_values_are_ignored_but_a_retained_availability_is_reported() -> None:

@@ -5,27 +5,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
+from bms_estimator.pack_model.accuracy import Accuracy, Window, bound, improvements
+from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.prior import DIRECTION_CORRELATION_SOC, curve_covariance
 from bms_estimator.pack_model.unknowns import DIRECTIONS
-from tests.benchmarks.observability import (
-    CELLS,
-    LOWEST_SOCS,
-    NOT_FULL_SOC,
-    RATED_AH,
-    Observability,
-    Window,
-    bound,
-    curves,
-    std_row,
-)
 
 PAGE = Path(__file__).parents[2] / "docs" / "theory" / "observability.md"
+CELLS = ("nmc", "nca", "lmo", "lfp", "ncr18650")
+"""Generic cells, and the file of one measured cell."""
+LOWEST_SOCS = (0.12, 0.30, 0.50)
+"""Lower ends of the windows of the documented table [SOC]."""
+SOCS = np.array([0.2, 0.35, 0.5, 0.65, 0.8, 0.9])
+"""SOCs of the columns of the documented table."""
+RATED_AH = 3.0
+"""Capacity of the cells [Ah]. No result depends on it."""
 TOLERANCE = 0.11
 """Tolerance of a documented std, which is rounded to 0.1 [%]."""
 SMOOTH_SOC = 0.03
 """Std of the Gaussian kernel that smooths the simulated curves. Curves of real cells have no steps [SOC]."""
+
+
+def curves(name: str) -> CellCurves:
+    """Return the curves of a cell."""
+    return CellCurves(Estimator(load_cell(name, RATED_AH)).cell_file_settings)
 
 
 def documented() -> dict[tuple[str, float, bool], list[str]]:
@@ -43,50 +48,57 @@ def documented() -> dict[tuple[str, float, bool], list[str]]:
 
 @pytest.mark.parametrize("name", CELLS)
 def test_the_documented_table_has_the_computed_values(name: str) -> None:
-    rows, cell = documented(), curves(load_cell(name, RATED_AH))
+    rows, cell = documented(), curves(name)
     for low in LOWEST_SOCS:
         for full in (False, True):
-            _, _, *values = std_row(Observability(cell, Window(low, full=full)))[:-1]
-            expected = rows[name, low, full]
-            assert [v == "-" for v in values] == [v == "-" for v in expected]
-            numbers = [(float(v), float(e)) for v, e in zip(values, expected, strict=True) if v != "-"]
+            result, expected = Accuracy(cell, Window(low, full=full)), rows[name, low, full]
+            stds = [*result.std(SOCS), result.mean_std, result.capacity_std]
+            is_inside = [*(low <= SOCS), True, True]
+            assert [v != "-" for v in expected] == is_inside
+            numbers = [(100.0 * std, float(e)) for std, e in zip(stds, expected, strict=True) if e != "-"]
             assert all(abs(value - number) < TOLERANCE for value, number in numbers)
 
 
 @pytest.mark.parametrize("name", CELLS)
 def test_a_full_charge_lowers_the_std_and_a_narrow_window_raises_it(name: str) -> None:
-    cell, at = curves(load_cell(name, RATED_AH)), np.array([0.65])
-    stds = [Observability(cell, Window(low)).std(at)[0] for low in LOWEST_SOCS]
+    cell, at = curves(name), np.array([0.65])
+    stds = [Accuracy(cell, Window(low)).std(at)[0] for low in LOWEST_SOCS]
     assert stds == sorted(stds)
     assert stds[0] < stds[-1]
     for low in LOWEST_SOCS:
-        assert bound(cell, (low, 1.0), full=True) < 0.9 * bound(cell, (low, NOT_FULL_SOC), full=False)
+        assert bound(cell, (low, 1.0), full=True) < 0.9 * bound(cell, (low, Window.high), full=False)
 
 
 def test_an_unseen_charge_raises_the_std_and_a_measured_capacity_lowers_it() -> None:
-    cell = curves(load_cell("lfp", RATED_AH))
+    cell = curves("lfp")
     usual, unseen, measured = (
-        Observability(cell, window).mean_std
+        Accuracy(cell, window).mean_std
         for window in (Window(0.12), Window(0.12, charge_seen=False), Window(0.12, capacity_std=0.01))
     )
     assert measured < 0.9 * usual < 0.9 * unseen
 
 
 def test_the_voltages_cannot_separate_soc_and_capacity_from_the_curve() -> None:
-    """The change of the curve is the slope times the change of the SOC, so that the voltages stay the same."""
-    cell, window = curves(load_cell("nca", RATED_AH)), Window(0.12)
-    result = Observability(cell, window)
-    assert (result.spectrum[0] < 1e-6).sum() == 2
-    ends_soc = window.soc[[0, window.soc.size // 2, -1]]
-    for change in result.unseen_changes():
-        soc = change.soc + change.ln_q * (ends_soc - result.middle)
-        assert change.curve_v == pytest.approx(-cell.slope(ends_soc) * soc, abs=6e-3)
+    """A shift and a stretch of the SOC with the curve leave the voltages as they are."""
+    assert (Accuracy(curves("nca"), Window(0.12)).spectrum[0] < 1e-6).sum() == 2
+
+
+def test_each_change_lowers_the_std_of_an_lfp_pack_that_is_never_full() -> None:
+    cell, window = curves("lfp"), Window(0.2, 0.9, has_temperature=False)
+    stds, present = improvements(cell, window), Accuracy(cell, window).mean_std
+    assert [*stds] == ["a measured OCV curve", "a full charge each week", "discharges to 10%", "a temperature sensor"]
+    assert list(stds.values()) == sorted(stds.values())
+    assert max(stds.values()) < present
+
+
+def test_changes_in_force_are_not_proposed() -> None:
+    assert [*improvements(curves("ncr18650"), Window(0.05, full=True))] == []
 
 
 @pytest.mark.parametrize(("name", "tolerance"), [("ncr18650", 0.1), ("nmc", 0.2)])
 def test_the_error_in_a_simulation_agrees_with_the_std(name: str, tolerance: float) -> None:
     window = Window(0.30)
-    rms_std = np.sqrt(np.mean(Observability(curves(load_cell(name, RATED_AH)), window).std(window.soc) ** 2))
+    rms_std = np.sqrt(np.mean(Accuracy(curves(name), window).std(window.soc) ** 2))
     errors = errors_of_draws(name, window, 200)
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(rms_std, rel=tolerance)
     assert np.mean(np.abs(errors) < 2.0 * rms_std) > 0.9
@@ -98,7 +110,7 @@ def errors_of_draws(name: str, window: Window, draws: int) -> Floats:
     The voltages are those of a random curve. The least-squares estimate starts at the true SOC and is linearized again at
     each iteration. The hysteresis is known.
     """
-    rng, cell, soc = np.random.default_rng(1), curves(load_cell(name, RATED_AH)), window.soc
+    rng, cell, soc = np.random.default_rng(1), curves(name), window.soc
     grid = np.linspace(0.0, 1.0, 101)
     root = np.linalg.cholesky(curve_covariance(cell, grid) + 1e-10 * np.eye(grid.size))
     kernel = np.exp(-0.5 * ((grid[:, None] - grid) / SMOOTH_SOC) ** 2)

@@ -1,0 +1,143 @@
+"""``bms-estimator accuracy``: how well the SOC of a pack can be known in its use, and which change helps most."""
+
+import json
+import math
+import sys
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from bms_estimator.checkpoint.state_files import StateFiles
+from bms_estimator.cli.options.capture_options import CELL_HELP, AsJson, CapacityAh, complete_battery
+from bms_estimator.cli.options.compile_progress import compile_ahead
+from bms_estimator.cli.options.pack_options import pack_or_cell
+from bms_estimator.cli.options.table import print_table
+from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.kernels.kalman_filter.anchors import FULL
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.errors import UserError
+from bms_estimator.model.pack_model import PackModel
+from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements
+from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.process.state_folder import state_folder
+from bms_estimator.settings.pack import Settings
+
+MIN_WINDOW = 0.05
+"""Minimum width of a window [SOC]."""
+
+
+@dataclass(frozen=True)
+class AccuracyResult:
+    """Output of ``--json``. SOCs and stds are fractions."""
+
+    low: float
+    high: float
+    full_charges: int | None
+    """Number of full charges in the history; None without a history."""
+    has_temperature: bool
+    best_std: float
+    """Lower bound of the std of the SOC, mean over the window."""
+    best_capacity_std: float
+    """Lower bound of the relative std of the capacity."""
+    present_std: float | None
+    """Std of the SOC in the last checkpoint; None without a pack."""
+    with_change: dict[str, float]
+    """Lower bound of the std of the SOC after each change, the lowest first."""
+
+
+def accuracy(
+    pack: Annotated[
+        Path | None,
+        typer.Option(help="settings file of the pack: use and full charges come from its history", show_default=False),
+    ] = None,
+    cell: Annotated[
+        str | None, typer.Option(help=CELL_HELP, autocompletion=complete_battery, show_default=False)
+    ] = None,
+    capacity_ah: CapacityAh = None,
+    between: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="LOW HIGH",
+            help="lowest and highest SOC of the use [%]; HIGH of 100: with full charges; default: those of the history",
+            show_default=False,
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compute how well the SOC can be known in a use, and which change of the use or of the equipment helps most.
+
+    The result is a lower bound: the std that is left after any time if only the cell file is known. An estimator that states a smaller
+    std is wrong. With --cell, a pack without a temperature sensor is assumed.
+    """
+    if pack is None and between is None:
+        raise UserError("give --pack pack.toml, or --cell NAME with --between LOW HIGH")
+    settings, model = pack_or_cell(pack, cell, capacity_ah)
+    if not isinstance(model, CellModel):
+        raise UserError(f"{model.cell.name}: a fuel cell has no SOC")
+    present_std, full_charges = None, None
+    if pack is None:
+        window = Window(0.0, has_temperature=False)
+    else:
+        compile_ahead()
+        window, present_std, full_charges = _use_of_pack(settings, model)
+    if between is not None:
+        window = _with_ends(window, *between)
+    curves = CellCurves(make_estimator(settings, model).cell_file_settings)
+    best = Accuracy(curves, window)
+    result = AccuracyResult(
+        float(window.soc[0]), float(window.soc[-1]), full_charges, window.has_temperature,
+        best.mean_std, best.capacity_std, present_std, improvements(curves, window),
+    )  # fmt: skip
+    if as_json:
+        sys.stdout.write(json.dumps(asdict(result)) + "\n")
+    else:
+        _print(result)
+
+
+def _with_ends(window: Window, low: float, high: float) -> Window:
+    """Return a window with other ends [%]. A window up to 100 % has full charges."""
+    if not (low >= 0.0 and high <= 100.0 and high - low >= 100.0 * MIN_WINDOW):
+        raise UserError(
+            f"--between {low:g} {high:g}: give two SOCs from 0 to 100 with a distance of at least {MIN_WINDOW:.0%}"
+        )
+    return Window(low / 100.0, high / 100.0, full=high == 100.0, has_temperature=window.has_temperature)
+
+
+def _use_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, int]:
+    """Return the window of a pack's history, the std of its SOC, and its number of full charges.
+
+    Raises:
+        UserError: No checkpoint, or a history of a use that is too small.
+    """
+    files = StateFiles(state_folder(settings), settings, model)
+    saved = files.saved_pack().pack
+    if saved.slow_fit is None or saved.slow_fit.history.rows.size == 0:
+        raise UserError(f"{files.history.path}: no history of the use yet; give --between LOW HIGH")
+    rows, fit = saved.slow_fit.history.rows, saved.slow_fit.saved_fit
+    soc = np.clip(rows["soc"] if fit is None else fit.row_soc, 0.0, 1.0)
+    full_charges = int((rows["reference_kind"] == FULL).sum())
+    has_temperature = bool(saved.estimator.record[0]["filter"]["sensed"])
+    low, high = float(soc.min()), float(soc.max())
+    if high - low < MIN_WINDOW:
+        raise UserError(f"{files.history.path}: a use from {low:.0%} to {high:.0%} only; give --between LOW HIGH")
+    is_charge_seen = bool((rows["current_a"] < 0.0).any())
+    window = Window(low, high, full_charges > 0, is_charge_seen, has_temperature)
+    return window, float(saved.estimator.soc_std), full_charges
+
+
+def _print(result: AccuracyResult) -> None:
+    """Print the result as a table."""
+    full = "" if result.full_charges is None else f", {result.full_charges} full charges"
+    sensor = "" if result.has_temperature else ", no temperature sensor"
+    typer.echo(f"SOC {result.low:.0%} to {result.high:.0%}{full}{sensor}")
+    rows = [("smallest possible std", result.best_std)]
+    if result.present_std is not None and math.isfinite(result.present_std):
+        rows.append(("std today", result.present_std))
+    rows += [(f"smallest possible std with {name}", std) for name, std in result.with_change.items()]
+    print_table(["", "SOC"], [(name, f"{100.0 * std:.1f} %") for name, std in rows])
+    best = next(iter(result.with_change), None)
+    if best is not None and result.with_change[best] < result.best_std:
+        typer.echo(f"{best[0].upper()}{best[1:]} helps most.")

@@ -1,0 +1,114 @@
+"""``bms-estimator backup`` and ``restore``: settings and learned state of a pack in one file, to move it to another machine."""
+
+import io
+import re
+import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bms_estimator.installation import places
+from bms_estimator.installation.pack_files import named_files
+from bms_estimator.model.config_file import parse_toml
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.process.private_file import write_private
+from bms_estimator.process.state_folder import state_folder_path
+from bms_estimator.settings.pack import Settings, load_settings
+
+SETTINGS, STATE = "settings", "state"
+"""Folders in the archive."""
+Pack = Annotated[Path, typer.Argument(metavar="PACK.toml", help="settings file of the pack")]
+Archive = Annotated[Path, typer.Argument(metavar="FILE", help="archive, .tar.gz")]
+
+
+def backup(pack: Pack, file: Archive) -> None:
+    """Write the settings of a pack, their passwords, and everything learned to one archive. Stop its service first.
+
+    `restore` reads the archive on another machine.
+    """
+    settings = load_settings(pack)
+    with _state_files(pack, settings) as (folder, files):
+        if not files:
+            raise UserError(f"{folder}: has no state of the pack {settings.pack.name}; is the user the right one?")
+        content = io.BytesIO()
+        with tarfile.open(fileobj=content, mode="w:gz") as archive:
+            archive.add(pack, f"{SETTINGS}/{pack.name}")
+            for named in named_files(pack, settings):
+                archive.add(named, f"{SETTINGS}/{named.name}")
+            for each in files:
+                archive.add(each, f"{STATE}/{each.name}", recursive=False)
+    with _reported(file):
+        write_private(file, content.getvalue())
+    typer.echo(f"{file}: {len(files)} files of the state of {settings.pack.name}, and its settings")
+
+
+def restore(file: Archive, pack: Pack) -> None:
+    """Restore the learned state of a pack from an archive of `backup`. Stop its service first.
+
+    The settings of the archive are written if PACK.toml does not exist; otherwise they must have the same `pack.name`.
+    A state that exists already is not replaced.
+    """
+    with _reported(file), tarfile.open(file) as archive:
+        contents = {member.name: _read(archive, member) for member in archive.getmembers() if member.isfile()}
+    saved = {name.removeprefix(f"{STATE}/"): data for name, data in contents.items() if name.startswith(f"{STATE}/")}
+    files = {Path(name).name: data for name, data in contents.items() if name.startswith(f"{SETTINGS}/")}
+    if not saved or not files:
+        raise UserError(f"{file}: is not an archive of bms-estimator backup")
+    text = next(iter(files.values())).decode()  # backup adds the settings file first
+    archived = parse_toml(text, Settings, str(file))
+    settings = load_settings(pack) if pack.exists() else archived
+    if settings.pack.name != archived.pack.name:
+        raise UserError(f"{file}: is of the pack {archived.pack.name}, and {pack} is {settings.pack.name}")
+    with _state_files(pack, settings) as (folder, existing):
+        if existing:
+            raise UserError(f"{existing[0]}: the pack has a state already; move it away to restore that of {file}")
+        with _reported(folder):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            for name, data in saved.items():
+                if not _pattern(settings.pack.name).fullmatch(name):
+                    raise UserError(f"{file}: {name}: is not a file of the pack {settings.pack.name}")
+                write_private(folder / name, data)
+            if not pack.exists():
+                for name, data in {**files, pack.name: text.encode()}.items():
+                    if not (pack.parent / name).exists():
+                        write_private(pack.parent / name, data)
+    typer.echo(f"{folder}: {len(saved)} files of the state of {settings.pack.name} restored; settings: {pack}")
+
+
+@contextmanager
+def _state_files(pack: Path, settings: Settings) -> Iterator[tuple[Path, list[Path]]]:
+    """Yield the state folder of a pack and the files in it, while no service can run.
+
+    Raises:
+        UserError: The service of the pack runs, or the folder cannot be read.
+    """
+    is_installed = pack.resolve().parent == places.SETTINGS and settings.state.folder is None
+    folder = (places.STATE if is_installed else state_folder_path(settings)).expanduser()
+    with _reported(folder), instance_lock(folder, settings.pack.name):
+        found = folder.iterdir() if folder.is_dir() else iter(())
+        pattern = _pattern(settings.pack.name)
+        yield folder, sorted(each for each in found if each.is_file() and pattern.fullmatch(each.name))
+
+
+def _pattern(name: str) -> re.Pattern[str]:
+    """Return the pattern of the names of the files of a pack's state."""
+    return re.compile(rf"{re.escape(name)}(-[0-9a-f]{{8}})?\.[a-z0-9.-]+")
+
+
+def _read(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
+    content = archive.extractfile(member)
+    return content.read() if content else b""
+
+
+@contextmanager
+def _reported(path: Path) -> Iterator[None]:
+    """Convert an error of a file or an archive to UserError."""
+    try:
+        yield
+    except (OSError, tarfile.TarError, EOFError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise UserError(f"{path}: {reason}") from None

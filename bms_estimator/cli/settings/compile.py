@@ -1,0 +1,21 @@
+"""``bms-estimator compile``: compilation of the kernels ahead of the first start."""
+
+import typer
+
+from bms_estimator.cli.options.compile_progress import compile_ahead
+from bms_estimator.model.errors import UserError
+from bms_estimator.numba_cache import CACHE_FOLDER, SHIPPED_FOLDER
+from bms_estimator.service.kernel_compilation import COMPLETE_FILE
+
+
+def compile_command() -> None:
+    """Compile the kernels, so that no later start does.
+
+    The folder is $NUMBA_CACHE_DIR, or the cache folder of the user. An image sets the variable to the folder `compiled` in
+    the folder of the package.
+    """
+    if CACHE_FOLDER is None:
+        raise UserError("no folder for compiled kernels can be written: set NUMBA_CACHE_DIR=FOLDER")
+    compile_ahead()
+    is_shipped = (SHIPPED_FOLDER / COMPLETE_FILE).exists()
+    typer.echo(f"compiled kernels: {SHIPPED_FOLDER if is_shipped else CACHE_FOLDER}")

@@ -1,0 +1,183 @@
+"""Lower bound of the std of the SOC: the std that voltages leave after infinite time, and changes that lower it.
+
+A pack passes a window of SOC again and again. Every error that differs from pass to pass averages out. What remains is the
+error of the cell file's OCV curve, and an error by direction (charge, discharge, rest) that recurs at each pass. The
+unknowns are the SOC, the capacity, the hysteresis and the curve, with the priors of the slow fit. The model is linear in
+small deviations:
+
+    voltage error = slope (dSOC + (SOC - middle) d ln Q) + hysteresis + curve + error by direction
+
+This std is a lower bound: no estimator that knows no more than the cell file can have a smaller error on average over the
+possible cells and over the window. At single SOCs, as near full, the std may be smaller than this mean. Resistances are left
+out, because rests separate them: with their prior and currents of 0.4 C the std changes by less than 0.01 %.
+"""
+
+from collections.abc import Iterator
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V, MAX_SLOPE_V
+from bms_estimator.kernels.accumulators.history import ROW_SOC
+from bms_estimator.model.arrays import Floats
+from bms_estimator.pack_model.cell_curves import DIRECTION_STD_RANGE_V, SOC_GRID, CellCurves
+from bms_estimator.pack_model.prior import (
+    DIRECTION_CORRELATION_SOC,
+    ENTROPY_STD_V,
+    HYSTERESIS_STD,
+    MIN_FULL_STD,
+    NEW_SEGMENT_STD,
+    curve_covariance,
+)
+
+DISCHARGE_C = 0.4
+"""C-rate of a discharge whose charge is not seen. The offset of the current sensor is then an error of the capacity."""
+UNMEASURED_K = 10.0
+"""Std of the deviation of an unmeasured temperature from 25 C [K], as for ``noise.UNSENSED_R_STD``."""
+LOW_SOC = 0.1
+"""Proposed lower end of discharge [SOC]."""
+MEASURED_FRACTION = 0.8
+"""Maximum std of a measured curve, as a fraction of the present std, for which its measurement is proposed."""
+SOC, LN_Q, HYSTERESIS, CURVE = 0, 1, 2, 3
+"""Positions of the unknowns; the curve's errors are the last ones."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """SOCs that a pack passes again and again, and what is measured of it."""
+
+    low: float
+    high: float = 0.95
+    full: bool = False
+    """True: the end of a charge is seen again and again. The window then ends at SOC 1."""
+    charge_seen: bool = True
+    has_temperature: bool = True
+    capacity_std: float | None = None
+    """Std of ln(true / declared capacity); None: that of the cell file."""
+
+    @property
+    def soc(self) -> Floats:
+        """SOCs of the history's rows, evenly spaced."""
+        high = 1.0 if self.full else self.high
+        return np.linspace(self.low, high, max(round((high - self.low) / ROW_SOC), 1) + 1)
+
+
+class Accuracy:
+    """Information of infinitely many passes of a window.
+
+    Args:
+        cell: Curves and prior of the cell.
+        window: SOCs that the pack passes.
+    """
+
+    def __init__(self, cell: CellCurves, window: Window) -> None:
+        self.cell, self.window, self.soc = cell, window, window.soc
+        self.middle = 0.5 * (self.soc[0] + self.soc[-1])
+
+    def prior(self) -> Floats:
+        """Return the prior covariance of the unknowns."""
+        capacity_std = self.cell.capacity_std if self.window.capacity_std is None else self.window.capacity_std
+        offset_c = self.cell.offset_std_a / self.cell.one_c_a
+        relative_offset = 0.0 if self.window.charge_seen else offset_c / DISCHARGE_C
+        covariance = np.zeros((CURVE + self.soc.size,) * 2)
+        covariance[SOC, SOC] = NEW_SEGMENT_STD**2
+        covariance[LN_Q, LN_Q] = capacity_std**2 + relative_offset**2
+        covariance[HYSTERESIS, HYSTERESIS] = 2.0 * HYSTERESIS_STD**2  # fast and slow part are both saturated
+        curve_v2 = curve_covariance(self.cell, self.soc) + 1e-10 * np.eye(self.soc.size)
+        if not self.window.has_temperature:
+            by_kelvin_v = np.hypot(np.interp(self.soc, SOC_GRID, self.cell.per_kelvin_v), ENTROPY_STD_V)
+            curve_v2 += np.outer(UNMEASURED_K * by_kelvin_v, UNMEASURED_K * by_kelvin_v)
+        covariance[CURVE:, CURVE:] = curve_v2
+        return covariance
+
+    def information(self) -> Floats:
+        """Return the information on the unknowns: of discharge, rest and charge, and of the ends of charge."""
+        distance = np.abs(self.soc[:, None] - self.soc)
+        precision = np.linalg.inv(np.exp(-distance / DIRECTION_CORRELATION_SOC)) / self.cell.direction_std_v**2
+        signs = (-1.0, -1.0, 1.0) if self.window.charge_seen else (-1.0, -1.0)
+        slope_v = self.cell.slope(self.soc)
+        half_v = np.interp(self.soc, SOC_GRID, self.cell.hysteresis_v)
+        total = np.zeros((CURVE + self.soc.size,) * 2)
+        for sign in signs:
+            h = np.column_stack([slope_v, slope_v * (self.soc - self.middle), sign * half_v, np.eye(self.soc.size)])
+            total += h.T @ precision @ h
+        if self.window.full:
+            at_full = self.soc_derivatives(np.ones(1))[0]
+            total += np.outer(at_full, at_full) / MIN_FULL_STD**2
+        return total
+
+    def soc_derivatives(self, soc: Floats) -> Floats:
+        """Return the derivatives of the SOC by the unknowns for each estimated SOC in ``soc``, shape (n, unknowns)."""
+        rows = np.zeros((soc.size, CURVE + self.soc.size))
+        rows[:, SOC], rows[:, LN_Q] = 1.0, soc - self.middle
+        return rows
+
+    @cached_property
+    def spectrum(self) -> tuple[Floats, Floats]:
+        """Information in units of the prior, ascending, and the directions that belong to it, as columns."""
+        root = np.linalg.cholesky(self.prior())
+        values, vectors = np.linalg.eigh(root.T @ self.information() @ root)
+        return np.maximum(values, 0.0), root @ vectors
+
+    def std(self, soc: Floats) -> Floats:
+        """Return the std of the SOC for each estimated SOC in ``soc``."""
+        values, vectors = self.spectrum
+        return np.sqrt((self.soc_derivatives(soc) @ vectors) ** 2 @ (1.0 / (1.0 + values)))
+
+    @property
+    def capacity_std(self) -> float:
+        """Std of ln(true / declared capacity)."""
+        values, vectors = self.spectrum
+        return float(np.sqrt(vectors[LN_Q] ** 2 @ (1.0 / (1.0 + values))))
+
+    @property
+    def mean_std(self) -> float:
+        """Mean of the std over the window."""
+        return float(self.std(self.soc).mean())
+
+
+def bound(cell: CellCurves, window: tuple[float, float], *, full: bool) -> float:
+    """Return the lower bound of the std of the SOC after infinite time, mean over a window.
+
+    Args:
+        cell: Curves and prior of the cell.
+        window: Lowest and highest SOC that the pack passes.
+        full: True: the ends of charges are seen.
+    """
+    return Accuracy(cell, Window(*window, full=full)).mean_std
+
+
+def improvements(cell: CellCurves, window: Window) -> dict[str, float]:
+    """Return the lower bound of the std in the present window after each possible change, the lowest first.
+
+    A change that is in force already is left out.
+    """
+    stds = {
+        name: float(Accuracy(changed_cell, changed).std(window.soc).mean())
+        for name, changed_cell, changed in _changes(cell, window)
+    }
+    return dict(sorted(stds.items(), key=lambda item: item[1]))
+
+
+def _changes(cell: CellCurves, window: Window) -> Iterator[tuple[str, CellCurves, Window]]:
+    """Yield each possible change with its cell and window."""
+    if not window.full:
+        yield "a full charge each week", cell, replace(window, full=True)
+    if window.low > LOW_SOC:
+        yield f"discharges to {LOW_SOC:.0%}", cell, replace(window, low=LOW_SOC)
+    measured = measured_curve(cell)
+    if measured.ocv_std_v.mean() < MEASURED_FRACTION * cell.ocv_std_v.mean():
+        yield "a measured OCV curve", measured, window
+    if not window.has_temperature:
+        yield "a temperature sensor", cell, replace(window, has_temperature=True)
+
+
+def measured_curve(cell: CellCurves) -> CellCurves:
+    """Return a cell whose curve was measured with the pack's own sensor, so that it contains the sensor's gain."""
+    measured = copy(cell)
+    slope_v = np.minimum(cell.slope(SOC_GRID), MAX_SLOPE_V)
+    measured.ocv_std_v = np.minimum(cell.ocv_std_v, np.hypot(CURVE_ERROR_V, CURVE_ERROR_SOC * slope_v))
+    measured.gain_std, measured.direction_std_v = 0.0, min(cell.direction_std_v, DIRECTION_STD_RANGE_V[0])
+    return measured

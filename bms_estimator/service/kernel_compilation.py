@@ -1,0 +1,205 @@
+"""Compilation of the kernels in child processes, which end before they take much memory.
+
+numba does not free the memory of a compilation before its process ends. Children therefore compile the kernels of a
+recorded order, one after the other, and write them to the cache of ``numba_cache``. A child ends when it has grown to
+``MAX_CHILD_BYTES``, and another one continues. Afterwards the program loads the kernels from the cache.
+"""
+
+import contextlib
+import importlib
+import os
+import queue
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any, NamedTuple, cast
+
+import numpy as np
+from numba import from_dtype, types
+
+from bms_estimator.model.errors import TemporaryError
+from bms_estimator.numba_cache import CACHE_FOLDER, SHIPPED_FOLDER
+from bms_estimator.process.memory import anonymous_bytes, available_bytes
+from bms_estimator.process.systemd import extend_start
+
+ORDER_FILE = Path(__file__).with_name("compile_order.txt")
+"""File with the kernels in the order in which a first start compiled them: CPU time [s], name and types of the arguments.
+``make compile-order`` writes it."""
+MAX_CHILD_BYTES = 160 * 2**20
+"""Anonymous memory above which a child ends [bytes]. One kernel adds at most 25 MiB."""
+CHILD_BYTES = 256 * 2**20
+"""Available memory for which one child is started [bytes]."""
+MAX_FAILURES = 3
+"""Maximum number of children that end early, for example for lack of memory."""
+REPORT_S = 0.5
+"""Interval between two reports of the progress [s]."""
+COMPLETE_FILE = f"complete-py{sys.version_info[0]}{sys.version_info[1]}-{os.uname().machine}"
+"""File in a folder of compiled kernels that contains all kernels of this version of Python and this architecture."""
+
+
+class Progress(NamedTuple):
+    """Progress of a compilation."""
+
+    kernels: int
+    """Number of kernels that are compiled."""
+    all_kernels: int
+    cpu_s: float
+    """Recorded CPU time of the kernels that are compiled [s]."""
+    all_cpu_s: float
+
+
+class Kernel(NamedTuple):
+    """Kernel of the recorded order."""
+
+    cpu_s: float
+    """Recorded CPU time of its compilation, without the kernels that it calls [s]."""
+    call: str
+    """Name and types of the arguments, such as ``kernels.trace.write (TRACE, float64,)``."""
+
+
+def compile_order() -> list[Kernel]:
+    """Return the kernels in the recorded order. A kernel follows the kernels that it calls."""
+    lines = ORDER_FILE.read_text(encoding="utf-8").splitlines()
+    return [Kernel(float(seconds), call) for seconds, call in (line.split(" ", 1) for line in lines)]
+
+
+def is_compiled() -> bool:
+    """Return True if all kernels were compiled, or if there is no folder for them."""
+    return CACHE_FOLDER is None or any((folder / COMPLETE_FILE).exists() for folder in (SHIPPED_FOLDER, CACHE_FOLDER))
+
+
+def compile_kernels(report: Callable[[Progress], None] = lambda _: None) -> None:
+    """Compile all kernels that are not in the cache, in as many children as CPUs and memory allow.
+
+    Args:
+        report: Called with the progress, in the calling thread.
+
+    Raises:
+        TemporaryError: The children end early.
+    """
+    if CACHE_FOLDER is None or is_compiled():
+        return
+    order = compile_order()
+    pending, done = queue.SimpleQueue[Kernel](), list[Kernel]()
+    for kernel in order:
+        pending.put(kernel)
+    count = max(1, min(len(os.sched_getaffinity(0)), available_bytes() // CHILD_BYTES))
+    compilers = [_Compiler(pending, done) for _ in range(count)]
+    try:
+        for compiler in compilers:
+            compiler.start()
+        while running := [compiler for compiler in compilers if compiler.is_alive()]:
+            report(Progress(len(done), len(order), sum(each.cpu_s for each in done), sum(each.cpu_s for each in order)))
+            extend_start(f"compiling kernels: {len(done)} of {len(order)}")
+            running[0].join(REPORT_S)
+    finally:
+        for compiler in compilers:
+            compiler.stop()
+    if len(done) < len(order):
+        raise TemporaryError(
+            f"the kernels cannot be compiled: the compiler ended {MAX_FAILURES} times; it needs {CHILD_BYTES >> 20} MiB "
+            f"of memory, and {available_bytes() >> 20} MiB are available"
+        )
+    (CACHE_FOLDER / COMPLETE_FILE).touch()
+
+
+class _Compiler(threading.Thread):
+    """Thread that passes kernels to one child after the other."""
+
+    def __init__(self, pending: "queue.SimpleQueue[Kernel]", done: list[Kernel]) -> None:
+        super().__init__(daemon=True)
+        self._pending, self._done = pending, done
+        self._lock, self._stopped = threading.Lock(), False
+        self._child: subprocess.Popen[str] | None = None
+
+    def run(self) -> None:
+        """Compile the pending kernels."""
+        failures = 0
+        kernel = self._next()
+        while kernel and failures < MAX_FAILURES and (child := self._start_child()):
+            count = len(self._done)
+            with contextlib.suppress(BrokenPipeError), child:  # the child ended, and closing its input fails
+                kernel = self._compile_in(child, kernel)
+            failures = failures + 1 if len(self._done) == count else 0
+        if kernel:
+            self._pending.put(kernel)
+
+    def _compile_in(self, child: subprocess.Popen[str], kernel: Kernel | None) -> Kernel | None:
+        """Compile kernels until the child ends or no kernel is pending; return the kernel that the child did not compile."""
+        stdin, stdout = cast("IO[str]", child.stdin), cast("IO[str]", child.stdout)
+        while kernel:
+            with contextlib.suppress(BrokenPipeError):  # the child ended
+                stdin.write(f"{kernel.call}\n")
+                stdin.flush()
+            if not stdout.readline():
+                return kernel
+            self._done.append(kernel)
+            kernel = self._next()
+        stdin.close()
+        return None
+
+    def _next(self) -> Kernel | None:
+        with contextlib.suppress(queue.Empty):
+            return self._pending.get_nowait()
+        return None
+
+    def _start_child(self) -> subprocess.Popen[str] | None:
+        with self._lock:
+            if self._stopped:
+                return None
+            self._child = subprocess.Popen(  # noqa: S603 - this module
+                [sys.executable, "-P", "-m", __name__, str(MAX_CHILD_BYTES)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                start_new_session=True,  # Ctrl-C in the terminal ends only this process, which ends its children
+            )
+        return self._child
+
+    def stop(self) -> None:
+        """End the child and the thread."""
+        with self._lock:
+            self._stopped = True
+            if self._child:
+                self._child.kill()
+        self.join()
+
+
+def argument_types() -> dict[str, Any]:
+    """Return the types of numba, and those of the package's structured dtypes by the names of their constants."""
+    importlib.import_module("bms_estimator.service.kernel_warm_up")  # all modules with kernels
+    modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("bms_estimator.")]
+    constants = [(name, value) for module in modules for name, value in vars(module).items() if name.isupper()]
+    records = {name: value for name, value in constants if isinstance(value, np.dtype) and value.names}
+    return vars(types) | {name: from_dtype(record) for name, record in records.items()}
+
+
+def compile_call(call: str, names: dict[str, Any]) -> None:
+    """Compile a kernel for the types of its arguments, or load it from the cache.
+
+    Args:
+        call: Name and types, as in ``Kernel``.
+        names: Types by the names that ``call`` uses.
+    """
+    name, arguments = call.split(" ", 1)
+    module, function = name.rsplit(".", 1)
+    kernel = getattr(importlib.import_module(f"bms_estimator.{module}"), function)
+    kernel.compile(eval(arguments, names))  # noqa: S307 - a file of this package
+
+
+def _compile_calls(calls: Iterator[str], max_bytes: int) -> None:
+    """Compile kernels, and write a line to stdout after each. End when this process has more than ``max_bytes`` of memory."""
+    names = argument_types()
+    for call in calls:
+        with contextlib.suppress(Exception):  # a kernel of an outdated order; the program compiles what is missing
+            compile_call(call, names)
+        sys.stdout.write("\n")
+        sys.stdout.flush()
+        if anonymous_bytes() > max_bytes:
+            return
+
+
+if __name__ == "__main__":
+    _compile_calls(iter(sys.stdin), int(sys.argv[1]))

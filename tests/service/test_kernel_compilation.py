@@ -1,0 +1,84 @@
+"""Compilation in child processes: the recorded order, the end of a child, and a child that fails."""
+
+import gc
+import sys
+from pathlib import Path
+
+import pytest
+from numba.core import event
+from numba.core.dispatcher import Dispatcher
+
+from bms_estimator.model.errors import TemporaryError
+from bms_estimator.service import kernel_compilation
+from bms_estimator.service.kernel_compilation import (
+    Progress,
+    argument_types,
+    compile_call,
+    compile_kernels,
+    compile_order,
+    is_compiled,
+)
+from bms_estimator.service.kernel_warm_up import load_kernels
+
+
+class CompiledKernels(event.Listener):
+    """Listener that stores the names of the kernels that numba compiles."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def on_start(self, started: event.Event) -> None:
+        self.names.append(started.data["dispatcher"].py_func.__qualname__)
+
+    def on_end(self, _: event.Event) -> None:
+        pass
+
+
+def test_the_recorded_order_is_that_of_this_version() -> None:
+    """If it fails: ``make compile-order``."""
+    load_kernels()
+    compiled, names = CompiledKernels(), argument_types()
+    with event.install_listener("numba:compile", compiled):
+        for kernel in compile_order():
+            compile_call(kernel.call, names)
+    assert compiled.names == []
+    gc.unfreeze()
+    recorded = {kernel.call.split(" ")[0] for kernel in compile_order()}
+    functions = [each.py_func for each in gc.get_objects() if isinstance(each, Dispatcher) and each.signatures]
+    loaded = {f"{each.__module__}.{each.__qualname__}" for each in functions}
+    assert "bms_estimator.kernels.step.run" in loaded
+    order_of_step = {f"bms_estimator.{name}" for name in recorded if name.startswith("kernels.step.")}
+    assert order_of_step <= loaded
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return an empty cache folder, and reduce the order to a few kernels."""
+    order = [kernel for kernel in compile_order() if ".chen_mora." in kernel.call][:5]
+    monkeypatch.setattr(kernel_compilation, "compile_order", lambda: order)
+    monkeypatch.setattr(kernel_compilation, "CACHE_FOLDER", tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    return tmp_path
+
+
+def test_each_child_ends_at_its_limit_and_the_next_one_continues(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_compilation, "MAX_CHILD_BYTES", 1)
+    started, reports = [], list[Progress]()
+    popen = kernel_compilation.subprocess.Popen
+    monkeypatch.setattr(kernel_compilation.subprocess, "Popen", lambda *a, **k: started.append(a) or popen(*a, **k))
+    assert not is_compiled()
+    compile_kernels(reports.append)
+    assert is_compiled()
+    assert len(started) == len(list(cache.rglob("*.nbc"))) == 5
+    assert reports[-1].all_kernels == 5
+    compile_kernels(reports.append)
+    assert len(started) == 5
+
+
+def test_a_compiler_that_is_killed_is_an_error_that_names_the_memory(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(TemporaryError, match="the compiler ended 3 times; it needs 256 MiB of memory"):
+        compile_kernels()
+    assert not is_compiled()
