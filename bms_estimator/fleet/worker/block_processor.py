@@ -16,7 +16,7 @@ from bms_estimator.fleet.fits.messages import FitResult
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType, PackTypes
 from bms_estimator.fleet.worker import hour_summary
-from bms_estimator.fleet.worker.block_checks import MAX_TIMESTAMP_S, Arrival, clock_error_s
+from bms_estimator.fleet.worker.block_order import MAX_TIMESTAMP_S, Arrival, clock_error_s
 from bms_estimator.fleet.worker.block_result import BlockResult
 from bms_estimator.fleet.worker.pack_alarms import PackAlarms
 from bms_estimator.fleet.worker.pack_fits import PackFits

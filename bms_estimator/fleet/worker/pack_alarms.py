@@ -123,7 +123,8 @@ class PackAlarms:
             now_s: Wall clock [s since 1970].
             is_whole: True: also about alarms that have been raised or unwatched since an earlier block.
         """
-        if not (self._has_changed or is_whole):
+        slow_fit = pack_type.pack.slow_fit
+        if not (self._has_changed or is_whole or (slow_fit and slow_fit.changes > self._fits)):
             return ()
         changes = self._changes
         is_due = (changes["was_raised"] | changes["has_ended"] | changes["has_watch_changed"]) != 0

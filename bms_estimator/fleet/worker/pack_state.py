@@ -56,7 +56,7 @@ DELIVERY = np.dtype(
         ("last_s", "f8"),
         # current hour [hours since 1970]; 0: no block yet
         ("hour", "i8"),
-        # error of the edge's clock in the last block of this hour with an error beyond the limits of ``block_checks`` [s];
+        # error of the edge's clock in the last block of this hour with an error beyond the limits of ``block_order`` [s];
         # 0: none
         ("clock_error_s", "f8"),
         # ``PackType.config_digest`` of the settings with which the state was computed

@@ -13,7 +13,7 @@ from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.worker import pack_records
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CURRENT_LAYOUT
-from bms_estimator.fleet.worker.checkpoint.record_layout import cell_count, cell_layout
+from bms_estimator.fleet.worker.pack_records import cell_count, cell_layout
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import NO_CELLS
