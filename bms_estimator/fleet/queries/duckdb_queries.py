@@ -161,8 +161,8 @@ def run_query(
                 parameters["stds"] = _reporting_limit_stds(database)
         answer = _answer(_run(database, _sql(name), parameters), present.notes)
         if name == "soh" and not answer.rows:
-            days = "SELECT count(DISTINCT pack), coalesce(max(n), 0) FROM (SELECT pack, count(*) AS n FROM points WHERE quantity = 'capacity' GROUP BY pack)"
-            ((packs, most),) = database.execute(days).fetchall()
+            measured_days = "SELECT count(DISTINCT pack), coalesce(max(n), 0) FROM (SELECT pack, count(*) AS n FROM points WHERE quantity = 'capacity' GROUP BY pack)"
+            ((packs, most),) = database.execute(measured_days).fetchall()
             text = (
                 f"no trend yet: it needs {limits.min_days} days on which the capacity of a pack was measured, by a large change of its SOC; "
                 f"so far {packs} packs have such days, at most {most}"
