@@ -1,21 +1,29 @@
 """Files of the Docker image and of the Home Assistant add-on."""
 
+import asyncio
+import importlib.util
 import json
+import os
 import re
-import runpy
 import threading
 import tomllib
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
+import aiohttp
 import pytest
 
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.version import __version__
+from tests.command_line import PROGRAM
+from tests.free_port import free_port
+from tests.patience import LONG_S
 
 BROKER = {"host": "core-mosquitto", "port": 1883, "ssl": False, "username": "addons", "password": "open-sesame"}
 """Broker as the Supervisor describes it to add-ons."""
+PROJECT = Path(__file__).parents[2]
 PACK = '[pack]\ncell = "chen_mora"\n'
 
 
@@ -44,16 +52,27 @@ def supervisor() -> Iterator[str]:
 
 
 @pytest.fixture
-def with_broker(deploy, tmp_path, supervisor):
-    """Return the add-on's function that adds a broker to a pack file, with the folder ``data`` for its own files."""
-    (tmp_path / "data").mkdir()
-    script = runpy.run_path(str(deploy / "home-assistant/addon/run.py"))
-    return lambda pack: script["with_broker"](pack, tmp_path / "data", supervisor, "token")
+def addon(deploy, tmp_path, supervisor, monkeypatch):
+    """Return the add-on's script, with folders, Supervisor and ports of this test."""
+    spec = importlib.util.spec_from_file_location("addon_run", deploy / "home-assistant/addon/run.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    places = {"SETTINGS": tmp_path / "config", "DATA": tmp_path / "data", "SUPERVISOR": supervisor}
+    for name, value in (places | {"PAGE": f"127.0.0.1:{free_port()}", "INGRESS_PORT": free_port()}).items():
+        monkeypatch.setattr(script, name, value)
+    for folder in ("config", "data"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "data/options.json").write_text('{"pack_file": "pack.toml"}')
+    monkeypatch.setenv("SUPERVISOR_TOKEN", "token")
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    monkeypatch.setenv("PATH", f"{PROGRAM.parent}:{os.environ['PATH']}")
+    return script
 
 
-def test_addon_uses_the_broker_of_home_assistant(with_broker, tmp_path):
-    (tmp_path / "pack.toml").write_text(PACK)
-    settings = load_settings(with_broker(tmp_path / "pack.toml"))
+def test_addon_uses_the_broker_of_home_assistant(addon, tmp_path):
+    pack = tmp_path / "pack.toml"
+    pack.write_text(PACK)
+    settings = load_settings(addon.complete(pack, addon.DATA, addon.SUPERVISOR, "token"))
     assert settings.pack.cell == "chen_mora"
     assert settings.mqtt
     assert (settings.mqtt.urls, settings.mqtt.username) == (("mqtt://core-mosquitto:1883",), "addons")
@@ -62,10 +81,67 @@ def test_addon_uses_the_broker_of_home_assistant(with_broker, tmp_path):
     assert settings.mqtt.password_file.stat().st_mode & 0o777 == 0o600
 
 
-def test_addon_leaves_settings_with_a_broker_unchanged(with_broker, tmp_path):
+def test_addon_keeps_the_broker_of_the_settings(addon, tmp_path):
     pack = tmp_path / "pack.toml"
-    pack.write_text(f"{PACK}[mqtt]\n")
-    assert with_broker(pack) == pack
+    pack.write_text(f'{PACK}[mqtt]\nurl = "mqtt://elsewhere"\n')
+    settings = load_settings(addon.complete(pack, addon.DATA, "http://127.0.0.1:1", "token"))
+    assert settings.mqtt.urls == ("mqtt://elsewhere",)
+
+
+async def test_ingress_shows_the_setup_and_then_the_pack(addon, monkeypatch):
+    monkeypatch.setattr(addon, "INGRESS_PEER", "127.0.0.1")
+    ended = asyncio.create_task(addon.main())
+    prefix = "/api/hassio_ingress/abc"
+    async with aiohttp.ClientSession(
+        f"http://127.0.0.1:{addon.INGRESS_PORT}", headers={"X-Ingress-Path": prefix}
+    ) as browser:
+
+        async def text_of(path: str) -> str:
+            with suppress(aiohttp.ClientConnectorError):
+                async with browser.get(path) as response:
+                    if response.status == 200:
+                        assert "frame-ancestors 'self'" in response.headers["Content-Security-Policy"]
+                        return await response.text()
+            return ""
+
+        async def page_has(part: str) -> str:
+            async with asyncio.timeout(LONG_S):
+                while part not in (text := await text_of("/")):  # noqa: ASYNC110 - another process
+                    await asyncio.sleep(0.05)
+            return text
+
+        setup = await page_has("Set up a pack")
+        key = re.search(r'name="(\w+)" value="(\w+)"', setup)
+        async with browser.post("/search", data={key[1]: key[2]}, allow_redirects=False) as response:
+            assert (response.status, response.headers["Location"]) == (303, f"{prefix}/")
+        assert "name at least one place" in await text_of("/")
+        (addon.SETTINGS / "pack.toml").write_text(f'{PACK}[sensor]\nport = "/dev/none"\n')
+        await page_has("page.js")
+        async with browser.get("/events") as events:
+            assert await events.content.readline() == b"retry: 1000\n"
+    assert not ended.done()
+    ended.cancel()
+    with suppress(asyncio.CancelledError):
+        await ended
+
+
+async def test_ingress_rejects_other_clients(addon):
+    url = f"http://127.0.0.1:{addon.INGRESS_PORT}/"
+    async with (
+        addon.ingress(addon.PAGE, "token", "172.30.32.2", addon.INGRESS_PORT),
+        aiohttp.ClientSession() as other,
+        other.get(url) as response,
+    ):
+        assert response.status == 403
+
+
+@pytest.mark.parametrize("static", ["page/static", "setup/page"])
+def test_the_pages_work_below_any_path(static):
+    folder = PROJECT / "bms_estimator" / static
+    texts = [file.read_text() for file in folder.rglob("*") if file.suffix in {".html", ".js", ".py"}]
+    assert not [
+        link for text in texts for link in re.findall(r'(?:href|src|action)="/|(?:fetch|EventSource)\([`"]/', text)
+    ]
 
 
 def test_addon_has_the_version_of_the_program(deploy):

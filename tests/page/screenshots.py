@@ -41,7 +41,7 @@ CELLS, CAPACITY_AH = 16, 280.0
 """Number of cells, and their capacity [Ah]."""
 STEP_S, LIVE_S = 10.0, 600.0
 """Interval of the samples, and duration at the end with a sample each second, which the live curves show [s]."""
-FULL_V = 3.5
+FULL_V = 3.42
 """Voltage of a cell above which the charger reduces its current [V]."""
 TOP_PX = 500
 """Height of the upper part of the page, with alarms or the note about stale values [px]."""
@@ -145,8 +145,8 @@ async def shoot_first_day(folder: Path, browser: Browser) -> None:
 
 
 async def shoot_weeks(folder: Path, browser: Browser) -> None:
-    """Write screenshots of a pack after a week, discharging."""
-    async with House(7.0, 0.6, 20.0).page(folder) as url:
+    """Write screenshots of a pack after four days, discharging."""
+    async with House(4.0, 0.6, 20.0).page(folder) as url:
         async with open_page(browser, url) as page_tab:
             await shoot(page_tab, "desktop")
             await shoot(page_tab, "cells", ".cells")

@@ -45,5 +45,8 @@ async def restore_partition(
             else:
                 log.info("taken over", partition=number, sequence=partition.sequence, bytes=len(data))
                 return partition
-    log.info("taken over without a checkpoint: the stream is read from its beginning", partition=number)
+    log.warning(
+        "taken over without a checkpoint, which is right only for a new server: the stream is read from its beginning",
+        partition=number,
+    )
     return Partition(number, table, sources=sources)

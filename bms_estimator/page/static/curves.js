@@ -66,7 +66,7 @@ async function loadHistory(pack, span, onLoaded) {
 	pack.history[span] = { ...before, at: Date.now() };
 	let result = before?.data ? { data: before.data } : { reason: "The page's server does not answer." };
 	try {
-		const answer = await fetch(`/history?pack=${encodeURIComponent(pack.name)}&span=${span}`);
+		const answer = await fetch(`history?pack=${encodeURIComponent(pack.name)}&span=${span}`);
 		result = answer.ok ? { data: await answer.json() } : { reason: "No history is kept here: it lies where the pack's service runs." };
 	} catch { /* the status shows it, too */ }
 	for (const e of result.data?.events ?? []) pack.addEvent({ ...e, time: new Date(1e3 * e.time_s).toISOString() });

@@ -3,7 +3,7 @@ const SILENT_MS = 16_000; // an event arrives each 5 s
 
 /** Receive /events for ever. `onState` is called when `stream.open` may have changed. */
 export function listen(onMessage, onState, stream = { open: false }) {
-	const source = new EventSource("/events");
+	const source = new EventSource("events");
 	let last = Date.now();
 	const setOpen = (open) => { stream.open = open; onState(); };
 	source.onmessage = (event) => {

@@ -46,7 +46,7 @@ async function readForm() {
 }
 
 async function request(body) {
-	const response = await fetch(`/forecast?pack=${encodeURIComponent(shown)}`, { method: "POST", headers: { "Content-Type": "application/json" }, body });
+	const response = await fetch(`forecast?pack=${encodeURIComponent(shown)}`, { method: "POST", headers: { "Content-Type": "application/json" }, body });
 	if (!response.ok) throw new Error(await response.text());
 	const { data, error } = await response.json();
 	if (error) throw new Error(error);

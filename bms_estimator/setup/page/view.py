@@ -44,9 +44,9 @@ def page(session: SetupSession, form_key: str) -> str:
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">{refresh}<title>Set up a pack - bms_estimator</title>
-<link rel="icon" href="/icon.svg"><link rel="stylesheet" href="/style.css"><link rel="stylesheet" href="/setup.css">
-<script type="module" src="/setup.js"></script></head>
-<body class="setup"><header><img src="/icon.svg" alt="" width="30" height="30"><div class="who"><h1>Set up a pack</h1>
+<link rel="icon" href="icon.svg"><link rel="stylesheet" href="style.css"><link rel="stylesheet" href="setup.css">
+<script type="module" src="setup.js"></script></head>
+<body class="setup"><header><img src="icon.svg" alt="" width="30" height="30"><div class="who"><h1>Set up a pack</h1>
 <p id="what">{escape(str(session.file))}</p></div></header>
 <ol class="steps">{steps}</ol>{error}<main>{_BODIES[session.step](session, form_key)}</main></body></html>"""
 
@@ -54,7 +54,7 @@ def page(session: SetupSession, form_key: str) -> str:
 def _form(action: str, form_key: str, content: str, button: str, *, secondary: bool = False) -> str:
     css_class = ' class="secondary"' if secondary else ""
     return (
-        f'<form method="post" action="/{action}"><input type="hidden" name="{KEY_FIELD}" value="{form_key}">'
+        f'<form method="post" action="{action}"><input type="hidden" name="{KEY_FIELD}" value="{form_key}">'
         f"{content}<button{css_class}>{button}</button></form>"
     )
 

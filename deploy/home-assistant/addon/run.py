@@ -131,12 +131,17 @@ async def run_program(*arguments: str, until: Path | None = None) -> int:
     """Run bms-estimator; end it by SIGTERM of the Supervisor, or when the file ``until`` exists. Return its exit code."""
     child = await asyncio.create_subprocess_exec("bms-estimator", *arguments)
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, child.terminate)
-    while until and child.returncode is None and not until.exists():  # noqa: ASYNC240 - a local file
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(child.wait(), POLL_S)
-    if until and child.returncode is None:
-        child.terminate()
-    return await child.wait()
+    try:
+        while until and child.returncode is None and not until.exists():  # noqa: ASYNC240 - a local file
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(child.wait(), POLL_S)
+        if until is None:
+            await child.wait()
+    finally:
+        if child.returncode is None:
+            child.terminate()
+        code = await child.wait()
+    return code
 
 
 async def main() -> int:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import nats.errors
+import structlog
 from nats.aio.client import Client
 from nats.js.errors import KeyNotFoundError, KeyWrongLastSequenceError
 from nats.js.kv import KeyValue
@@ -27,6 +28,8 @@ from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import object_name
 from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError, is_readable
 from bms_estimator.model.errors import UserError
+
+log = structlog.get_logger(__name__)
 
 
 class FencedError(Exception):
@@ -85,15 +88,25 @@ class Claims:
     async def confirm(self, claim: Claim) -> Claim:
         """Read the claim again, because the last write may have succeeded without a response.
 
+        If the server has lost its data, the result claims a partition without a checkpoint, so that the worker saves its state.
+
         Raises:
             FencedError: Another worker has taken the partition over.
         """
         stored = await self._read(claim.partition)
+        if stored is None and await self._has_lost(claim):
+            log.error("the server has lost its checkpoints: the state is saved again", partition=claim.partition)
+            return Claim(claim.partition, 0, Pointer(worker=self._worker, next=claim.pointer.next))
         if stored is None or stored.revision <= claim.revision:  # a lower revision comes from a lagging node
             return claim
         if stored.pointer == self._last_sent.get(claim.partition):
             return Claim(claim.partition, stored.revision, stored.pointer)
         raise FencedError(stored.pointer.worker)
+
+    async def _has_lost(self, claim: Claim) -> bool:
+        """Return True if the bucket is a new one, which ends before the revision of a claim."""
+        state = (await self._bucket.status()).stream_info.state
+        return bool(claim.revision > state.last_seq)
 
     async def end(self, claim: Claim) -> None:
         """Record an orderly release of a partition whose last checkpoint is up to date.

@@ -3,7 +3,7 @@ for (const form of document.forms) form.addEventListener("submit", () => { for (
 
 const wait = document.getElementById("wait");
 if (wait) {
-	new EventSource("/events").onmessage = (event) => {
+	new EventSource("events").onmessage = (event) => {
 		const { estimate } = JSON.parse(event.data);
 		if (!estimate) return;
 		wait.hidden = true;
