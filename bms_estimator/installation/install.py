@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import subprocess
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -113,6 +114,23 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
     machine.run("systemctl", "enable", "--quiet", places.UNIT.name)
     report("service", "enabled: it starts with the machine")
     return True
+
+
+def compile_ahead(program: Path) -> None:
+    """Compile the kernels that the program lacks into the cache of the service, as its user. The terminal shows a bar.
+
+    Otherwise the start of the service would take minutes without an explanation. If the compilation fails, the service repeats it.
+    """
+    places.CACHE.mkdir(mode=0o755, exist_ok=True)
+    shutil.chown(places.CACHE, places.NAME, places.NAME)
+    variables = {
+        "NUMBA_CACHE_DIR": str(places.CACHE),
+        "PATH": places.SEARCH_PATH,
+        "TERM": os.environ.get("TERM", "dumb"),
+    }
+    subprocess.run(  # noqa: S603 - this program
+        [program, "compile"], env=variables, cwd="/", user=places.NAME, group=places.NAME, extra_groups=(), check=False
+    )
 
 
 def start() -> None:

@@ -137,7 +137,11 @@ def _minimize_from_all_starts(
 ) -> PackFit:
     """Return the mixture of the different minima that are reached from all starts."""
     equations = Equations(cell, rows, reference)
-    return mixture(equations, distinct_minima(equations, starts(equations, previous)))
+    minima = distinct_minima(equations, starts(equations, previous))
+    residuals = equations.residuals(minima[0].x)
+    if equations.weaken_misfits(residuals):
+        minima = distinct_minima(equations, [m.x for m in minima])
+    return replace(mixture(equations, minima), is_exchanged=is_exchanged(rows, residuals))
 
 
 def distinct_minima(equations: Equations, from_starts: list[Floats]) -> list[Minimum]:
@@ -240,7 +244,6 @@ def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
         cost=minima[0].cost,
         curves=tuple(m.x[u.curve.start :] for m in minima),
         first_segment=float(rows["segment"][0]),
-        is_exchanged=is_exchanged(rows, equations.residuals(minima[0].x)),
     )
 
 

@@ -47,6 +47,7 @@ TOP_PX = 500
 """Height of the upper part of the page, with alarms or the note about stale values [px]."""
 SETTINGS: dict[str, Any] = {
     "pack": {"name": "home", "cell": "lfp", "capacity_ah": CAPACITY_AH, "series": CELLS, "device_soc_std": 0.1},
+    "identifier": {"fit_interval_s": 86_400},
     "sensor": {"protocol": "text", "voltage_resolution_v": 0.01, "current_resolution_a": 0.01},
 }
 
@@ -202,7 +203,7 @@ async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         async with chromium() as browser:
-            for shots in (shoot_first_day, shoot_states, shoot_weeks, shoot_setup):
+            for shots in (shoot_first_day, shoot_weeks, shoot_states, shoot_setup):
                 await shots(folder, browser)
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.installation import places
-from bms_estimator.installation.install import PackFiles, install, restart_running, start, uninstall
+from bms_estimator.installation.install import PackFiles, compile_ahead, install, restart_running, start, uninstall
 from bms_estimator.installation.machine import Machine
 from bms_estimator.installation.pack_files import is_hidden, named_files
 from bms_estimator.installation.program_copy import copy_program, is_program_copy, system_python
@@ -50,7 +50,7 @@ def install_command(
         may_start = install(machine, program, files, _report)
     if machine.is_running and not no_start:
         if may_start:
-            typer.echo("starting; the first start compiles the kernels, which may take minutes", err=True)
+            compile_ahead(program)
             start()
             _report("service", "started")
         else:

@@ -133,7 +133,12 @@ TENANT: tuple[Definition[TenantState], ...] = (
     Definition(
         "bms_fleet_silent_packs",
         "Packs of the table of which no hourly summary has arrived for 3 h; computed once a minute",
-        lambda s: s.silent,
+        lambda s: s.problems and s.problems.silent,
+    ),
+    Definition(
+        "bms_fleet_alarm_packs",
+        "Packs of the table with raised alarms in the last hourly summary; computed once a minute",
+        lambda s: s.problems and s.problems.alarms,
     ),
     Definition("bms_fleet_mqtt_sessions", "MQTT sessions, including those of disconnected edges", _mqtt_sessions),
     Definition("bms_fleet_stream_messages", "Stored messages of a stream", _of_streams(lambda s: s.messages), "stream"),

@@ -1,13 +1,21 @@
-"""Packs of a tenant without a recent hourly summary. A worker publishes the summary of an hour when the pack's next hour begins."""
+"""Packs of a tenant without a recent hourly summary, and packs with alarms in the last one.
+
+A worker publishes the summary of an hour when the pack's next hour begins.
+"""
 
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.metrics.states import Problems
 from bms_estimator.fleet.nats.bucket_reader import BucketReader
 from bms_estimator.fleet.nats.stream_reader import read_stream
 
 SILENT_S = 3.0 * 3600.0
 """Time without a summary after which a pack counts as silent [s], about that of the query ``silent``."""
+
+
+ALARMS = b'"alarms":"'
+"""Part of a summary with raised alarms; other summaries do not have the field."""
 
 
 class ArrivalWatch:
@@ -22,10 +30,11 @@ class ArrivalWatch:
     def __init__(self, nc: Client) -> None:
         self._nc, self._table = nc, BucketReader(nc, subjects.PACKS_BUCKET)
         self._last_s: dict[str, float] = {}  # by pack of the table
+        self._with_alarms = set[str]()
         self._next_sequence: int | None = None  # in the stream ``HOURS``
 
-    async def silent_packs(self, now_s: float) -> int:
-        """Read the changes since the last call. Return the number of packs of the table without a summary for ``SILENT_S``.
+    async def problems(self, now_s: float) -> Problems:
+        """Read the changes since the last call, and return the present numbers.
 
         Raises:
             StreamError: The server does not respond or rejects a request.
@@ -35,6 +44,7 @@ class ArrivalWatch:
         def set_row(pack: str, row: bytes | None) -> None:
             if row is None:
                 self._last_s.pop(pack, None)
+                self._with_alarms.discard(pack)
             else:
                 self._last_s.setdefault(pack, now_s)
 
@@ -48,5 +58,6 @@ class ArrivalWatch:
                 pack = message.subject.rpartition(".")[2]
                 if pack in self._last_s:
                     self._last_s[pack] = now_s
+                    (self._with_alarms.add if ALARMS in message.data else self._with_alarms.discard)(pack)
             self._next_sequence = batch[-1].sequence + 1
-        return sum(now_s - last_s > SILENT_S for last_s in self._last_s.values())
+        return Problems(sum(now_s - last_s > SILENT_S for last_s in self._last_s.values()), len(self._with_alarms))

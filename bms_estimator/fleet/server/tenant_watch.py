@@ -1,4 +1,4 @@
-"""Watch over one tenant: heartbeats of its workers, its streams, unsaved blocks, and silent packs."""
+"""Watch over one tenant: heartbeats of its workers, its streams, unsaved blocks, and silent packs and alarms."""
 
 import asyncio
 import contextlib
@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fleet_workers import FleetWorkers
 from bms_estimator.fleet.heartbeat import Heartbeat
-from bms_estimator.fleet.metrics.states import StreamState, TenantState
+from bms_estimator.fleet.metrics.states import Problems, StreamState, TenantState
 from bms_estimator.fleet.nats.backlog import undelivered_messages
 from bms_estimator.fleet.nats.connection import close
 from bms_estimator.fleet.nats.stream_reader import StreamError
@@ -48,7 +48,7 @@ class TenantWatch:
         self._workers = FleetWorkers(node.partitions, LAG_WINDOW_S)
         self._nc: Client | None = None
         self._unsaved_share: float | None = None
-        self._silent: int | None = None
+        self._problems: Problems | None = None
 
     async def run(self) -> None:
         """Receive heartbeats, and log a warning while more than half of the stream is unsaved, until cancelled."""
@@ -86,7 +86,7 @@ class TenantWatch:
             )
             for info in infos
         }
-        return TenantState(heartbeats, undelivered, streams, self._unsaved_share, self._silent)
+        return TenantState(heartbeats, undelivered, streams, self._unsaved_share, self._problems)
 
     async def _watch_until_disconnected(self) -> None:
         """Connect, and watch until the connection has ended."""
@@ -100,7 +100,7 @@ class TenantWatch:
             await nc.subscribe(subjects.worker(), cb=self._receive)
             await self._check_periodically(nc, closed)
         finally:
-            self._nc = self._unsaved_share = self._silent = None
+            self._nc = self._unsaved_share = self._problems = None
             self._workers.clear()
             await close(nc)
 
@@ -108,7 +108,7 @@ class TenantWatch:
         """Compute the unsaved share and the silent packs periodically until the connection has ended."""
         arrivals = ArrivalWatch(nc)
         while not closed.is_set():
-            self._silent = await arrivals.silent_packs(time.monotonic())
+            self._problems = await arrivals.problems(time.monotonic())
             unsaved = await unsaved_blocks(nc, range(self._node.partitions))
             self._unsaved_share = unsaved.share
             if unsaved.warning:

@@ -15,7 +15,7 @@ from bleak.exc import BleakError
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.sources.ble import BleSource
-from bms_estimator.sources.bluetooth.source import convert_sample
+from bms_estimator.sources.bluetooth.bms_sample import convert_sample
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
 SCAN_S = 15.0
