@@ -32,11 +32,11 @@ COUNT_STD_SOC = 0.004
 KNEE_STD_SOC, KNEE_WIDTH_SOC = 0.015, 0.12
 """Std of the position of the OCV's knee near empty, and SOC over which it decays [SOC]. Without this std, a slow first charge
 from empty gave an SOC 6 to 8 % wrong, because errors of offset, capacity and knee have equal effects on the voltage."""
-SURFACE_STD_SOC = 0.03
-"""Std of the SOC at the surface of the particles about the model, per C-rate of discharge at 25 C [SOC]. It is proportional to the
-filtered current of the RC pair ``TREND``. The voltage collapses when the surface is empty: at 0 C and 1C, a cell of 58 Ah
-ends its discharge with 20 % of its charge left. Without this std, the fit takes the collapse for the knee of the OCV, and the
-capacity is 18 % too small. Diffusion depends on the temperature as the strong part of the resistances does."""
+SURFACE_STD_SOC, SURFACE_WIDTH_SOC = 0.03, 0.25
+"""Std of the SOC at the surface of the particles about the model, per C-rate of discharge at 25 C, and SOC over which it decays
+[SOC]. The C-rate is that of the filtered current of the RC pair ``TREND``. The voltage collapses when the surface is empty: at 0 C
+and 1C, a cell of 58 Ah ends its discharge with 20 % of its charge left. Without this std, the fit takes the collapse for the knee of
+the OCV. Diffusion depends on the temperature as the strong part of the resistances does."""
 EMPTY_RELATIVE, EMPTY_WIDTH_SOC = 0.4, 0.04
 """Relative std of the overpotential at SOC 0, and SOC over which it decays. Both are assumed, because resistances near empty
 depend on the cell and on the load."""
@@ -190,7 +190,8 @@ def by_surface(cell: CellCurves, rows: NDArray[np.void], z: Floats, drop_v: Floa
     """
     discharge_c = np.where(rows["direction"] > 0.0, np.maximum(rows["x_a"][:, TREND], 0.0), 0.0) / cell.one_c_a
     lowest = np.minimum(z, cell.soc(rows["voltage_v"] / cell.series + drop_v))
-    return np.asarray((cell.slope(lowest) * SURFACE_STD_SOC * discharge_c * strong) ** 2)
+    std_soc = SURFACE_STD_SOC * discharge_c * strong * np.exp(-((lowest / SURFACE_WIDTH_SOC) ** 2))
+    return np.asarray((cell.slope(lowest) * std_soc) ** 2)
 
 
 def by_sampling(rows: NDArray[np.void], ohm: Floats) -> Floats:
