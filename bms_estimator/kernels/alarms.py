@@ -387,7 +387,7 @@ def _evaluate_inputs(
     o = e.observer
     unusable = o.dropped_not_finite + o.dropped_range + o.dropped_saturated
     good, bad = o.samples - a.accepted, unusable - a.unusable
-    if good < 0 or bad < 0:  # the counters have begun anew
+    if good < 0 or bad < 0:  # the counters were reset
         good, bad = o.samples, unusable
     a.accepted, a.unusable = o.samples, unusable
     value = math.nan if is_first or good + bad <= 0 else bad / (good + bad)

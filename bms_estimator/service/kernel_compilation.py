@@ -164,7 +164,8 @@ class _Compiler(threading.Thread):
             self._stopped = True
             if self._child:
                 self._child.kill()
-        self.join()
+        if self.ident is not None:  # Ctrl-C may come before the thread is started
+            self.join()
 
 
 def argument_types() -> dict[str, Any]:

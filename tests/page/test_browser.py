@@ -284,7 +284,7 @@ async def test_lock_and_e_of_the_observer_are_shown_under_its_name_and_not_on_th
 
 async def test_an_soc_that_is_not_known_is_not_shown_as_a_number(browser: Browser, programs: RunningPrograms) -> None:
     async with dashboard_of(browser, programs, "cellar") as page_tab:
-        page, parts = page_tab.page, ("#soc", "#scale", ".soc .band")
+        page, parts = page_tab.page, ("#soc", "#scale", "[data-of=soc_std]")
         for known in (True, False, True):
             await publish_state(programs.live, **STATE_VALUES | {"soc_known": known})
             await page.locator("#soc").wait_for(state="visible" if known else "hidden")

@@ -5,7 +5,7 @@ import nats
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import purge_keys, write_bucket
-from bms_estimator.fleet.server.arrival_watch import SILENT_S, ArrivalWatch
+from bms_estimator.fleet.server.tenant_watch import SILENT_S, ArrivalWatch
 from tests.fleet.hour_rows import make_hour
 from tests.fleet.nats_cluster import running
 
