@@ -142,7 +142,7 @@ TENANT: tuple[Definition[TenantState], ...] = (
     ),
     Definition(
         "bms_fleet_alarm_packs",
-        "Packs of the table with raised alarms in the last hourly summary; computed once a minute",
+        "Packs of the table with the alarm weak_cell or cell_short in the last hourly summary; computed once a minute",
         lambda s: s.problems and s.problems.alarms,
     ),
     Definition("bms_fleet_mqtt_sessions", "MQTT sessions, including those of disconnected edges", _mqtt_sessions),

@@ -28,7 +28,7 @@ class Problems(NamedTuple):
     silent: int
     """Packs without a summary for the time ``arrival_watch.SILENT_S``."""
     alarms: int
-    """Packs with raised alarms at the end of the last hour."""
+    """Packs with the alarm weak_cell or cell_short at the end of the last hour."""
 
 
 @dataclass(frozen=True)

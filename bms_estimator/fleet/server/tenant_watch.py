@@ -5,6 +5,7 @@ A worker publishes the summary of an hour when the pack's next hour begins.
 
 import asyncio
 import contextlib
+import re
 import time
 from pathlib import Path
 
@@ -31,8 +32,8 @@ SILENT_S = 3.0 * 3600.0
 """Time without a summary after which a pack counts as silent [s], about that of the query ``silent``."""
 
 
-ALARMS = b'"alarms":"'
-"""Part of a summary with raised alarms; other summaries do not have the field."""
+ALARMS = re.compile(rb'"alarms":"[^"]*(weak_cell|cell_short)')
+"""Part of a summary with an alarm of a faulty cell. Other alarms are also raised in healthy packs."""
 
 
 class ArrivalWatch:
@@ -75,7 +76,7 @@ class ArrivalWatch:
                 pack = message.subject.rpartition(".")[2]
                 if pack in self._last_s:
                     self._last_s[pack] = now_s
-                    (self._with_alarms.add if ALARMS in message.data else self._with_alarms.discard)(pack)
+                    (self._with_alarms.add if ALARMS.search(message.data) else self._with_alarms.discard)(pack)
             self._next_sequence = batch[-1].sequence + 1
         return Problems(sum(now_s - last_s > SILENT_S for last_s in self._last_s.values()), len(self._with_alarms))
 

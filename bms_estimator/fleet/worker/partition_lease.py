@@ -189,7 +189,12 @@ class PartitionLease:
                 and not self.is_checkpoint_too_new
             ):
                 return
-            snapshot, partition.deferred.is_saved = partition.snapshot(), True
+            await (
+                self._confirm_claim()
+            )  # before the snapshot, because a server that has lost its data begins a new stream
+            if self.claim is None:
+                return
+            claim, snapshot, partition.deferred.is_saved = self.claim, partition.snapshot(), True
             try:
                 # Summaries and dead letters are sent first, because the next owner does not compute those of saved samples
                 # again.
@@ -313,11 +318,17 @@ class PartitionLease:
 
     async def _confirm_claim(self) -> None:
         """Confirm this worker's claim, if any; the caller holds ``_state_lock``."""
-        if self.claim:
-            try:
-                self.claim = await self._checkpoints.claims.confirm(self.claim)
-            except _FENCED as error:
-                self._drop_ownership(error)
+        if self.claim is None:
+            return
+        revision = self.claim.revision
+        try:
+            self.claim = await self._checkpoints.claims.confirm(self.claim)
+        except _FENCED as error:
+            self._drop_ownership(error)
+            return
+        if self.partition and revision > self.claim.revision:  # the server has lost its data: its stream begins again
+            self.partition.sequence = 0
+            self.partition.deferred.clear()
 
     def _drop_ownership(self, error: Exception) -> None:
         """Drop state and claim, because another worker has claimed the partition."""

@@ -57,6 +57,17 @@ def test_deviation_of_a_cell_in_few_hours_is_not_named(tmp_path):
     assert failing(tmp_path, deviation, HEALTHY, deviation | {"weakest_cell": 7}, HEALTHY) == []
 
 
+def test_alarms_of_a_faulty_cell_in_the_last_hour_are_named(tmp_path):
+    assert failing(tmp_path, {}, {"alarms": "cell_short cell_imbalance weak_cell"}) == [
+        ("alarm: cell_short", None, None),
+        ("alarm: weak_cell", None, None),
+    ]
+
+
+def test_alarms_that_have_ended_are_not_named(tmp_path):
+    assert failing(tmp_path, {"alarms": "cell_short"}, {}) == []
+
+
 def test_cell_with_85_percent_of_the_capacity_is_named_and_a_healthy_pack_with_wrong_readings_is_not(tmp_path):
     for variant in ("85-percent", "offsets"):
         write(tmp_path, rows_of_pack("lfp", variant, days=6))

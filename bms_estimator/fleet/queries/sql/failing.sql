@@ -1,4 +1,4 @@
--- Packs with a faulty cell, packs that will soon reach a limit, and packs with recent input faults. Needs: hours, packs, days, fits.
+-- Packs with a faulty cell or an alarm of one, packs that will soon reach a limit, and packs with recent input faults. Needs: hours, packs, days, fits.
 WITH limits(quantity, limit_value, shown, sense) AS (
     VALUES ('capacity', ln($capacity_limit), 'capacity_ratio', -1), ('r_s', ln($r_s_limit), 'r_s_ratio', 1),
         ('margin', 0.0, 'stability_margin_min', -1)
@@ -47,6 +47,17 @@ suspected AS (
     HAVING value > 0.5
         AND coalesce(avg(CASE WHEN suspects & bit > 0 THEN 1 ELSE 0 END) FILTER (day <= $today - $recent_days), 1) < 0.1
 ),
+-- Other alarms, such as cell_imbalance in volts, are also raised in healthy packs
+raised AS (
+    SELECT
+        pack, 'alarm: ' || alarm AS quantity, NULL::DOUBLE AS value, NULL::DOUBLE AS limit_value, NULL::DOUBLE AS per_year,
+        0.0 AS days_left, NULL::DOUBLE AS earliest, NULL::DOUBLE AS latest, NULL::DOUBLE AS stds
+    FROM (
+        SELECT pack, unnest(string_split(arg_max_null(alarms, hour), ' ')) AS alarm
+        FROM hours WHERE hour // 24 > $today - $recent_days GROUP BY pack
+    )
+    WHERE alarm IN ('weak_cell', 'cell_short')
+),
 recent AS (
     SELECT *, count(*) OVER (PARTITION BY pack) AS hours FROM hours
     WHERE weakest_cell IS NOT NULL AND hour // 24 > $today - $recent_days
@@ -83,6 +94,7 @@ FROM (
     SELECT * FROM cells
     UNION ALL BY NAME SELECT * FROM trends WHERE stds > $stds AND days_left <= $within_days
     UNION ALL BY NAME SELECT * FROM suspected
+    UNION ALL BY NAME SELECT * FROM raised
 )
 JOIN packs USING (pack)
 ORDER BY days_left, cell IS NULL, stds DESC, pack, quantity
