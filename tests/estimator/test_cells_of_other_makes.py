@@ -1,5 +1,7 @@
 """Estimator with generic cell files on cells that were not used for them: LFP of a third make, and NMC."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ from tests.estimator.anywhere.score import score
     ],
 )
 def test_a_cell_of_another_make_is_estimated(
-    data, name: str, chemistry: str, capacity_ah: float, max_rmse: float, min_cover: float
+    data: Path, name: str, chemistry: str, capacity_ah: float, max_rmse: float, min_cover: float
 ) -> None:
     path = data / "pybatteryid" / f"{name}.csv.gz"
     time_s, true_soc = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 4), unpack=True)
