@@ -49,7 +49,7 @@ _MODULES = {
     "load_cell": "model.cell",
     "new_pack": "pack.pack",
     "validate": "calibration.validate",
-    "write_cell": "model.cell_file",
+    "write_cell": "model.pack_model",
 }
 """Module of each public name, imported on first use: importing numba alone would make ``bms-estimator --help`` too
 slow."""

@@ -11,7 +11,7 @@ from mkdocs.structure.files import File, Files
 
 from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
-from bms_estimator.fleet.metrics import definitions as fleet_definitions
+from bms_estimator.fleet.metrics import families as fleet_definitions
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.payload import Payload

@@ -18,6 +18,8 @@ import pytest
 from tests.free_port import free_port
 from tests.patience import LONG_S
 
+PASSWORD = "p@ss:word"
+"""Password with the separators of a URL."""
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
 
 
@@ -79,6 +81,14 @@ class Broker:
                 self._process = None
             except subprocess.TimeoutExpired:
                 assert time.monotonic() < deadline, "mosquitto did not end"
+
+
+def closed_broker(folder: Path) -> Broker:
+    """Return a broker that requires the user name ``owner`` and ``PASSWORD``, as that of Home Assistant does."""
+    passwords = folder / "passwords"
+    subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "owner", PASSWORD], check=True, capture_output=True)
+    passwords.chmod(0o644)
+    return Broker(folder, f"allow_anonymous false\npassword_file {passwords}")
 
 
 @pytest.fixture

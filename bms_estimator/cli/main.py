@@ -112,14 +112,14 @@ COMMANDS = {
     "uninstall": LazyCommand(
         "bms_estimator.cli.settings.install:uninstall_command", "Remove the service from this machine."
     ),
-    "compile": LazyCommand(
-        "bms_estimator.cli.settings.compile:compile_command", "Compile the kernels, so that no later start does."
-    ),
     "backup": LazyCommand(
         "bms_estimator.cli.settings.backup:backup", "Write settings and learned state of a pack to an archive."
     ),
     "restore": LazyCommand(
         "bms_estimator.cli.settings.backup:restore", "Restore settings and learned state of a pack from an archive."
+    ),
+    "compile": LazyCommand(
+        "bms_estimator.cli.settings.compile:compile_command", "Compile the kernels, so that no later start does."
     ),
     "config": LazyCommand("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
 }

@@ -64,7 +64,7 @@ class Heartbeat(BaseModel):
     unknown: tuple[str, ...] = ()
     """Names of some unknown packs."""
     clock_error_count: int = 0
-    """Number of packs whose edge's clock is wrong (``worker.block_checks``)."""
+    """Number of packs whose edge's clock is wrong (``worker.block_order``)."""
     clock_errors: dict[str, float] = Field(default_factory=dict)
     """Errors of some of these clocks by pack [s], the largest ones; positive if ahead."""
     waiting: int = 0

@@ -118,6 +118,9 @@ class Hour(Payload):
         default=None, description="self-discharge current of self_discharge_cell above the median of the cells [A]"
     )
     self_discharge_std_a: float | None = Field(default=None, description="standard deviation of self_discharge_a [A]")
+    alarms: str | None = Field(
+        default=None, description="names of the alarms that are raised at the end of the hour, with spaces between them"
+    )
     revision: int | None = Field(
         default=None,
         description="stream sequence number of the block that finished the row; of two rows of one hour the one with the "

@@ -8,7 +8,7 @@ from pydantic import Field
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.health import AnchorReport, FitReport, Health
 from bms_estimator.model.payloads.payload import Payload
-from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 
 MIN_UNSEEN_S = 1.0
 """Minimum duration of a gap that causes an event [s]. Shorter gaps only count in ``health``."""
@@ -49,7 +49,9 @@ class Event(Payload):
     )
 
 
-class _EventText(NamedTuple):
+class EventText(NamedTuple):
+    """Content of an event."""
+
     name: EventName
     text: str
     anchor: AnchorReport | None = None
@@ -65,19 +67,19 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
     """
     health = snapshot.health
     if before is None:
-        started = _EventText("start", f"checkpoint: {health.checkpoint}")
+        started = EventText("start", f"checkpoint: {health.checkpoint}")
         # at the start ``health.unseen_s`` is the gap between the runs; None: no gap, or an unknown length
         texts = [started, *_gap_event(health.unseen_s or 0.0), *_sensor_events(None, health)]
-        texts += [*_input_fault_events([], health.suspects), *_checkpoint_events("", health)]
+        texts += [*input_fault_events([], health.suspects), *_checkpoint_events("", health)]
     elif before.health is health:
         texts = []
     else:
         previous = before.health
         # the total counts all gaps since the previous snapshot; ``health.unseen_s`` is only the last gap
         gaps = _gap_event(health.total.unseen_s - previous.total.unseen_s)
-        texts = [*gaps, *_sensor_events(previous, health), *_input_fault_events(previous.suspects, health.suspects)]
+        texts = [*gaps, *_sensor_events(previous, health), *input_fault_events(previous.suspects, health.suspects)]
         texts += _checkpoint_events(previous.checkpoint, health)
-        texts += _soc_events(previous.identifier, health)
+        texts += soc_events(previous.identifier, health.identifier, health.anchor)
         texts += _fit_events(previous, health)
     health_events = [Event(time=health.publish_time, **text._asdict()) for text in texts]
     # alarms are evaluated for each snapshot, but several snapshots may share one ``health``
@@ -85,7 +87,7 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
     return health_events + [Event(time=alarm_time, **text._asdict()) for text in _alarm_events(before, snapshot)]
 
 
-def _alarm_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
+def _alarm_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[EventText]:
     """Yield raised and cleared alarms.
 
     An alarm that was cleared and raised again between the snapshots has another ``since``. Alarms that were raised before
@@ -95,45 +97,50 @@ def _alarm_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_Even
     for alarm in snapshot.alarms:
         since = previous_since.get(alarm.name)
         if since is not None and since != alarm.since:
-            yield _EventText("alarm_cleared", alarm.name)
+            yield EventText("alarm_cleared", alarm.name)
         if alarm.since is not None and since != alarm.since and alarm.since >= snapshot.info.started:
-            yield _EventText("alarm_raised", f"{alarm.name}: {alarm.text}")
+            yield EventText("alarm_raised", f"{alarm.name}: {alarm.text}")
     yield from _watch_events(before, snapshot)
 
 
-def _watch_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[_EventText]:
+def _watch_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[EventText]:
     """Yield alarms whose quantity has become unavailable or available."""
     was_watched = {alarm.name: alarm.watched for alarm in before.alarms} if before else {}
     for alarm in snapshot.alarms:
-        if was_watched.get(alarm.name, True) and not alarm.watched:
-            yield _EventText("alarm_unwatched", f"{alarm.name}: {alarm.unwatched_reason}")
-        elif alarm.watched and not was_watched.get(alarm.name, True):
-            yield _EventText("alarm_watched", alarm.name)
+        if alarm.watched != was_watched.get(alarm.name, True):
+            yield watch_event(alarm)
 
 
-def _gap_event(gap_s: float) -> Iterator[_EventText]:
+def watch_event(alarm: Alarm) -> EventText:
+    """Return the event of an alarm whose quantity has become unavailable or available."""
+    if alarm.watched:
+        return EventText("alarm_watched", alarm.name)
+    return EventText("alarm_unwatched", f"{alarm.name}: {alarm.unwatched_reason}")
+
+
+def _gap_event(gap_s: float) -> Iterator[EventText]:
     if gap_s >= MIN_UNSEEN_S:
-        yield _EventText("unseen", f"no measurements for {gap_s:.1f} s")
+        yield EventText("unseen", f"no measurements for {gap_s:.1f} s")
 
 
-def _sensor_events(previous: Health | None, health: Health) -> Iterator[_EventText]:
+def _sensor_events(previous: Health | None, health: Health) -> Iterator[EventText]:
     if previous is not None and previous.sensor_online == health.sensor_online:
         return
     if health.sensor_online:
-        yield _EventText("sensor_online", "samples arrive")
+        yield EventText("sensor_online", "samples arrive")
     elif previous is not None:  # an offline sensor at the start causes no event
-        yield _EventText("sensor_offline", health.sensor_message or "")
+        yield EventText("sensor_offline", health.sensor_message or "")
 
 
-def _input_fault_events(previous: list[str], present: list[str]) -> Iterator[_EventText]:
+def input_fault_events(previous: list[str], present: list[str]) -> Iterator[EventText]:
     """Yield input faults that began and ended. The numbers in a fault's text may change without an event."""
     before, after = ({_fault_text(sentence): sentence for sentence in sentences} for sentences in (previous, present))
     for fault_text, sentence in after.items():
         if fault_text not in before:
-            yield _EventText("suspicion", sentence)
+            yield EventText("suspicion", sentence)
     for fault_text, sentence in before.items():
         if fault_text not in after:
-            yield _EventText("suspicion_cleared", sentence)
+            yield EventText("suspicion_cleared", sentence)
 
 
 def _fault_text(sentence: str) -> str:
@@ -141,36 +148,47 @@ def _fault_text(sentence: str) -> str:
     return next((fault.text for fault in InputFault if sentence.endswith(fault.text)), sentence)
 
 
-def _soc_events(previous: Mapping[str, int], health: Health) -> Iterator[_EventText]:
-    """Yield the reasons of jumps of the SOC. ``previous`` are the earlier counters ``health.identifier``."""
+def soc_events(
+    previous: Mapping[str, int], counters: Mapping[str, int], anchor: AnchorReport | None
+) -> Iterator[EventText]:
+    """Yield the reasons of jumps of the SOC.
+
+    Args:
+        previous: Earlier counters, as from ``telemetry.health.identifier_counters``.
+        counters: Present counters.
+        anchor: Last end of a charge or discharge; None without one.
+    """
 
     def has_increased(name: str) -> bool:
-        return health.identifier.get(name, 0) > previous.get(name, 0)
+        return counters.get(name, 0) > previous.get(name, 0)
 
-    anchor = health.anchor
     if anchor is not None and (has_increased("full_anchors") or has_increased("empty_anchors")):
-        yield _EventText(anchor.kind, _anchor_text(anchor), anchor)
+        yield EventText(anchor.kind, _anchor_text(anchor), anchor)
     if has_increased("searched"):
-        yield _EventText(
+        yield EventText(
             "soc_reinitialized",
             "the voltage contradicted the SOC for minutes; the SOC is estimated again with a std of 20 %",
         )
     if has_increased("reset"):
-        yield _EventText("soc_reinitialized", "a value of the filter was not finite; its last good state was restored")
+        yield EventText("soc_reinitialized", "a value of the filter was not finite; its last good state was restored")
 
 
-def _fit_events(previous: Health, health: Health) -> Iterator[_EventText]:
+def _fit_events(previous: Health, health: Health) -> Iterator[EventText]:
     """Yield a fit of the pack's model that changed SOC or capacity."""
     before, model = previous.pack_model, health.pack_model
     if model is None or model.change is None or (before is not None and before.changes >= model.changes):
         return
-    change = model.change
+    yield fit_event(model.change)
+
+
+def fit_event(change: FitReport) -> EventText:
+    """Return the event of a fit of the pack's model that changed SOC or capacity."""
     text = (
         f"the fit to the pack's history changed the SOC from {100.0 * change.soc_before:.1f} to "
         f"{100.0 * change.soc_after:.1f} % and the capacity from {change.capacity_before_ah:.4g} to "
         f"{change.capacity_after_ah:.4g} Ah"
     )
-    yield _EventText("pack_fitted", text, fit=change)
+    return EventText("pack_fitted", text, fit=change)
 
 
 def _anchor_text(anchor: AnchorReport) -> str:
@@ -185,10 +203,10 @@ def _anchor_text(anchor: AnchorReport) -> str:
     return f"{cause}: {before} corrected to {100.0 * anchor.soc_after:.1f} %"
 
 
-def _checkpoint_events(previous: str, health: Health) -> Iterator[_EventText]:
+def _checkpoint_events(previous: str, health: Health) -> Iterator[EventText]:
     """Yield a change between success and failure of checkpoints; ``previous`` is the earlier ``health.checkpoint``."""
     failed_before, fails = previous.startswith(NOT_SAVED), health.checkpoint.startswith(NOT_SAVED)
     if fails and not failed_before:
-        yield _EventText("checkpoint_fails", health.checkpoint)
+        yield EventText("checkpoint_fails", health.checkpoint)
     elif failed_before and not fails:
-        yield _EventText("checkpoint_saved", health.checkpoint)
+        yield EventText("checkpoint_saved", health.checkpoint)

@@ -85,6 +85,10 @@ class CellCurves:
         below, above = np.minimum(soc, 0.0), np.maximum(soc - 1.0, 0.0)
         return np.asarray(inside + self._low_slope_v * below + self._high_slope_v * above)
 
+    def soc(self, ocv_v: Floats) -> Floats:
+        """Return the SOC, 0..1, at an OCV at 25 C [V]."""
+        return np.interp(ocv_v, self._ocv_v, self._soc)
+
     def slope(self, soc: Floats, half_width: float = SECANT_HALF_WIDTH_SOC) -> Floats:
         """Return the slope of the OCV as a secant over ``soc`` +- ``half_width`` [V per unit SOC]."""
         return np.asarray((self.ocv(soc + half_width) - self.ocv(soc - half_width)) / (2.0 * half_width))

@@ -21,6 +21,9 @@ from bms_estimator.pack_model.unknowns import Unknowns
 
 HUBER = 3.0
 """Residual beyond which the cost of a voltage grows linearly, in std."""
+FITTED_RMS, ZONES = 0.3, 10
+"""RMS residual of the rows of one SOC zone and direction that the model can fit [std], and number of zones over SOC 0..1. Where
+the model fits the pack, it is 0.05 to 0.3."""
 BEYOND_SOC = 0.03
 """Distance of an SOC from the range 0..1 up to which it has no cost. Assumed."""
 BEYOND_STD = 0.01
@@ -95,6 +98,22 @@ class Equations:
         std = np.where(self.is_full, FULL_REPEAT_STD, rows["reference_std"][self.known])
         # all ends of discharge together have the weight of one, because they have the same error
         self.known_std = std * np.where(kind == EMPTY, math.sqrt(max(int((kind == EMPTY).sum()), 1)), 1.0)
+
+    def weaken_misfits(self, r: Residuals) -> bool:
+        """Divide the weight of the rows of one SOC zone and direction by their RMS residual, as a multiple of ``FITTED_RMS``.
+
+        A cell that the model cannot fit thereby gets a larger std, and the zones that it fits determine the unknowns.
+
+        Returns:
+            True if a weight changed.
+        """
+        zone = (np.clip(r.prediction.soc, 0.0, 0.999) * ZONES).astype(np.intp)
+        zone += ZONES * (self.rows["direction"] + 1.0).astype(np.intp)
+        has_voltage = self.weight > 0.0
+        rows = np.maximum(np.bincount(zone, has_voltage), 1)
+        excess = np.sqrt(np.bincount(zone, r.voltage**2) / rows) / FITTED_RMS
+        self.weight = self.weight / np.maximum(excess, 1.0)[zone]
+        return bool((excess > 1.0).any())
 
     def residuals(self, x: Floats) -> Residuals:
         """Return residuals and cost at ``x``."""

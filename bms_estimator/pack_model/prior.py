@@ -44,7 +44,7 @@ HYSTERESIS_MEAN, HYSTERESIS_STD = 0.5, 0.5
 """Mean and std of the factors on the cell file's hysteresis in its fast and in its slow part."""
 ENTROPY_STD_V = 1.5e-4
 """Std of the error of the OCV's temperature coefficient [V/K]."""
-ARRHENIUS_STD = 0.004
+ARRHENIUS_STD = 0.015
 """Std of the error of the relative change of the resistances by temperature [1/K]."""
 MIN_FULL_STD = 0.006
 """Minimum std of the SOC at which this pack's charger ends, common to all charges."""

@@ -20,7 +20,7 @@ from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.sample_intervals import SampleCounts
+from bms_estimator.telemetry.alarms.sample_intervals import UNUSABLE_KINDS, SampleCounts
 from bms_estimator.telemetry.alarms.sensor_faults import BoardResets
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import sample_counters, suspicions
@@ -29,8 +29,6 @@ from bms_estimator.telemetry.impossible import PackBounds
 if TYPE_CHECKING:
     from bms_estimator.estimator.cell_estimator import CellDeviations
 
-UNUSABLE_KINDS = "not_finite", "range", "saturated"
-"""Kinds of dropped samples that indicate a sensor fault."""
 EVALUATION_S = 0.1
 """Interval between two evaluations [s]. An evaluation of each block would take as long as the estimate."""
 EVALUATION_ROWS = 1024

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.config_file import parse_toml
+from bms_estimator.model.errors import UserError
 from bms_estimator.service.pack_check import check_settings, summarize
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.pack_file import create_pack_file
@@ -44,7 +45,11 @@ def create_pack(file: Path, answers: Answers) -> NewPack:
     warnings = check_settings(settings, cell)
     create_pack_file(file, answers.tables)
     for section, login in answers.logins.items():
-        login.write_password(file.with_name(answers.password_file(section)))
+        path = file.with_name(answers.password_file(section))
+        try:
+            login.write_password(path)
+        except OSError as error:
+            raise UserError(f"{path}: the password cannot be written: {error.strerror}; write it there") from None
     return NewPack(settings, cell, warnings)
 
 

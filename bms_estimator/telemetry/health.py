@@ -51,7 +51,6 @@ def pack_model_health(model: SlowFit, times: FitTimes) -> PackModelHealth:
     estimator, rows = model.estimator, model.history.rows
     declared_ah = float(estimator.settings["capacity_as"][0]) / 3600.0
     capacity = relative_capacity(estimator.record[0]) if estimator.state["started"][0] else None
-    change = model.last_change
     return PackModelHealth(
         fits=model.fits,
         late=model.late,
@@ -64,13 +63,20 @@ def pack_model_health(model: SlowFit, times: FitTimes) -> PackModelHealth:
         capacity_std_ah=capacity.std * declared_ah if capacity else None,
         last_fit=None if times.finished_s is None else iso_utc(times.finished_s),
         last_fit_s=times.duration_s,
-        change=change
-        and FitReport(
-            soc_before=change.soc_before,
-            soc_after=change.soc_after,
-            capacity_before_ah=change.capacity_before * declared_ah,
-            capacity_after_ah=change.capacity_after * declared_ah,
-        ),
+        change=last_change(model),
+    )
+
+
+def last_change(model: SlowFit) -> FitReport | None:
+    """Return the last change of SOC and capacity by a fit; None: none since start."""
+    change, declared_ah = model.last_change, float(model.estimator.settings["capacity_as"][0]) / 3600.0
+    if change is None:
+        return None
+    return FitReport(
+        soc_before=change.soc_before,
+        soc_after=change.soc_after,
+        capacity_before_ah=change.capacity_before * declared_ah,
+        capacity_after_ah=change.capacity_after * declared_ah,
     )
 
 

@@ -6,24 +6,21 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.alarms import (
+    MAX_SPREAD_V,
+    MAX_SUM_DIFFERENCE,
+    MEAN_HIGH_V,
+    MEAN_LOW_V,
+    MILLI,
+    MIN_MEAN_V,
+)
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import MAX_CELL_V, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import Quantity
 
-MIN_MEAN_V = -1.0
-"""Lowest possible mean voltage of the cells of a pack [V]. A reversed cell reaches it, but never all cells at once."""
-MEAN_RANGE_V = 1.0, 5.0
-"""Range of the mean voltage of undamaged cells of any chemistry [V]."""
-MAX_SUM_DIFFERENCE = 0.2
-"""Highest possible difference between the pack's voltage and the sum of its cells, as a fraction of the higher one. Wires and
-contactors drop a few percent."""
-MAX_SPREAD_V = 1.0
-"""Maximum difference between cells that confirm each other [V]."""
 FACTORS = 10, 100, 1000
 """Usual factors between the scales or units of two devices."""
-MILLI = 1000.0
-"""Factor of a voltage in mV that is read as V."""
 FACTOR_TOLERANCE = 0.1
 """Tolerance of a ratio that shows one of the factors."""
 MIN_SWAPPED = 1e7
@@ -78,9 +75,7 @@ class PackBounds(NamedTuple):
         differs = (count == self.series) & (
             np.abs(pack_mean_v - mean_v) > MAX_SUM_DIFFERENCE * np.maximum(np.abs(pack_mean_v), np.abs(mean_v))
         )
-        pack_is_usual, cells_are_usual = (
-            (MEAN_RANGE_V[0] <= v) & (v <= MEAN_RANGE_V[1]) for v in (pack_mean_v, mean_v)
-        )
+        pack_is_usual, cells_are_usual = ((v >= MEAN_LOW_V) & (v <= MEAN_HIGH_V) for v in (pack_mean_v, mean_v))
         contradicts = differs & cells_are_usual
         cells_agree = highest_v - lowest_v <= MAX_SPREAD_V
         is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.sinks.mqtt.asyncapi import document
+from bms_estimator.cli.settings.asyncapi import document
 from tests.patience import LONG_S
 
 NODE = shutil.which("node")

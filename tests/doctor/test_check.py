@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from bms_estimator.doctor.check import Check, run_checks
+from bms_estimator.doctor.examine import Check, run_checks
 from bms_estimator.doctor.finding import Finding, Level, ok
 from bms_estimator.model.errors import UserError
 

@@ -2,8 +2,8 @@
 
 from bms_estimator.edge.block import decode
 from bms_estimator.fleet.ingest.batch_columns import BatchError
-from bms_estimator.fleet.ingest.batch_decoder import decode_batch
 from bms_estimator.fleet.ingest.batch_samples import BatchReader
+from bms_estimator.fleet.ingest.ingest import decode_batch
 from bms_estimator.fleet.ingest.open_blocks import NO_POSITION, OpenBlocks
 from tests.fuzz.edited_seeds import edited_seeds
 

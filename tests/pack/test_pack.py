@@ -80,7 +80,7 @@ def test_the_soc_of_the_device_narrows_the_first_band_of_a_new_lfp_pack_unless_i
         return trace[-1].copy()
 
     without, whole, far = last_row(device_soc[:0], 120), last_row(device_soc, 120), last_row(device_soc * 0.0, 120)
-    assert whole["soc_std"] < 0.5 * without["soc_std"]
+    assert whole["soc_std"] < 0.6 * without["soc_std"]
     assert abs(whole["soc"] - 0.6) < whole["soc_std"]
     assert last_row(device_soc, 7).tobytes() == last_row(device_soc, 1).tobytes() == whole.tobytes()
     assert far["soc"] > 0.2

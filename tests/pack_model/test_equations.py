@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.kernels.least_squares import backward_substitution, forward_substitution
-from bms_estimator.pack_model.equations import BEYOND_SOC, Equations
+from bms_estimator.pack_model.equations import BEYOND_SOC, FITTED_RMS, Equations
 from bms_estimator.pack_model.solve import cholesky, minimize
 from tests.pack_model.histories import (
     Truth,
@@ -170,3 +170,30 @@ def test_cholesky_factor_of_sparse_columns(segments: int) -> None:
     expected = np.linalg.cholesky(np.tril(a) + np.tril(a, -1).T)
     factor = cholesky(a, history.u.soc.start)
     np.testing.assert_allclose(np.tril(factor), expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+
+
+def test_a_collapse_of_the_voltage_under_load_in_the_cold_has_hardly_any_weight() -> None:
+    """At rest, the same voltage keeps its weight, because the surface of the particles is as full as their mean."""
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell), Truth())
+    discharge = np.flatnonzero(rows["direction"] > 0.0)[5:10]
+    rows["x_a"][discharge], rows["temperature_c"][discharge] = cell.one_c_a, 0.0
+    before = equations_of(cell, rows).weight
+    rows["voltage_v"][discharge] = 2.5 * cell.series
+    assert (equations_of(cell, rows).weight[discharge] < 0.2 * before[discharge]).all()
+    rows["direction"][discharge] = 0.0
+    assert (equations_of(cell, rows).weight[discharge] >= before[discharge]).all()
+
+
+def test_a_zone_that_the_model_cannot_fit_gets_its_residuals_as_std() -> None:
+    cell = cell_curves()
+    rows = with_voltages(cell, measured_rows(cell), Truth())
+    fitted = equations_of(cell, rows)
+    x = unknowns_of(fitted, Truth())
+    is_misfit = (rows["direction"] < 0.0) & (rows["soc"] > 0.3) & (rows["soc"] < 0.4)
+    assert not fitted.weaken_misfits(fitted.residuals(x))
+    rows["voltage_v"][is_misfit] += 1.2 / fitted.weight[is_misfit] * cell.series
+    misfit = equations_of(cell, rows)
+    assert misfit.weaken_misfits(misfit.residuals(x))
+    np.testing.assert_allclose(misfit.weight[is_misfit], fitted.weight[is_misfit] * FITTED_RMS / 1.2)
+    np.testing.assert_array_equal(misfit.weight[~is_misfit], fitted.weight[~is_misfit])

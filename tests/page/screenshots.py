@@ -41,12 +41,13 @@ CELLS, CAPACITY_AH = 16, 280.0
 """Number of cells, and their capacity [Ah]."""
 STEP_S, LIVE_S = 10.0, 600.0
 """Interval of the samples, and duration at the end with a sample each second, which the live curves show [s]."""
-FULL_V = 3.5
+FULL_V = 3.42
 """Voltage of a cell above which the charger reduces its current [V]."""
 TOP_PX = 500
 """Height of the upper part of the page, with alarms or the note about stale values [px]."""
 SETTINGS: dict[str, Any] = {
     "pack": {"name": "home", "cell": "lfp", "capacity_ah": CAPACITY_AH, "series": CELLS, "device_soc_std": 0.1},
+    "identifier": {"fit_interval_s": 86_400},
     "sensor": {"protocol": "text", "voltage_resolution_v": 0.01, "current_resolution_a": 0.01},
 }
 
@@ -145,8 +146,8 @@ async def shoot_first_day(folder: Path, browser: Browser) -> None:
 
 
 async def shoot_weeks(folder: Path, browser: Browser) -> None:
-    """Write screenshots of a pack after a week, discharging."""
-    async with House(7.0, 0.6, 20.0).page(folder) as url:
+    """Write screenshots of a pack after four days, discharging."""
+    async with House(4.0, 0.6, 20.0).page(folder) as url:
         async with open_page(browser, url) as page_tab:
             await shoot(page_tab, "desktop")
             await shoot(page_tab, "cells", ".cells")
@@ -202,7 +203,7 @@ async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         async with chromium() as browser:
-            for shots in (shoot_first_day, shoot_states, shoot_weeks, shoot_setup):
+            for shots in (shoot_first_day, shoot_weeks, shoot_states, shoot_setup):
                 await shots(folder, browser)
 
 

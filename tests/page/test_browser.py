@@ -284,11 +284,11 @@ async def test_lock_and_e_of_the_observer_are_shown_under_its_name_and_not_on_th
 
 async def test_an_soc_that_is_not_known_is_not_shown_as_a_number(browser: Browser, programs: RunningPrograms) -> None:
     async with dashboard_of(browser, programs, "cellar") as page_tab:
-        page, parts = page_tab.page, ("#soc", "#scale", ".soc .band")
+        page, parts = page_tab.page, ("#soc", "#scale", "[data-of=soc_std]")
         for known in (True, False, True):
             await publish_state(programs.live, **STATE_VALUES | {"soc_known": known})
             await page.locator("#soc").wait_for(state="visible" if known else "hidden")
-            assert await page.get_by_text("not known yet").is_visible() is not known
+            assert await page.locator("#unknownsoc").is_visible() is not known
             assert [await page.locator(part).is_visible() for part in parts] == [known] * len(parts)
             assert await page.title() == ("43 % · cellar" if known else "cellar")
         assert page_tab.errors == []
@@ -300,7 +300,7 @@ async def test_the_weakest_and_faulty_cells_are_named(browser: Browser, programs
         await publish(programs.live, "cells", CELLS_REPORT.model_dump_json(), retain=False)
         name = page_tab.page.locator("[data-q=weakestcell]")
         await name.get_by_text("cell 2, SOC 47.0 ± 2.0 %").wait_for()
-        assert (await name.inner_text()).endswith("; cell 2: internal short")
+        assert (await name.inner_text()).endswith("; cell 2: internal short; cell 3: contact")
         assert page_tab.errors == []
 
 

@@ -15,6 +15,7 @@ from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from tests.command_line import run
 from tests.device_line import running_device
+from tests.mosquitto import PASSWORD, closed_broker
 from tests.page.chromium import DESKTOP, PHONE, chromium, tab
 from tests.patience import LONG_S
 
@@ -93,19 +94,46 @@ async def answer_questions(page: Page) -> None:
     await page.get_by_role("button", name="Write").click()
 
 
+async def page_after(client: ClientSession, server_url: str, path: str, **fields: str) -> str:
+    """Submit a form of the page, and return the page after the search that it starts."""
+
+    async def text() -> str:
+        async with client.get(server_url) as answer:
+            return await answer.text()
+
+    key = re.search('name="form_key" value="([^"]*)"', await text())
+    assert key
+    await client.post(f"{server_url}{path}", data={**fields, "form_key": key[1]})
+    async with asyncio.timeout(LONG_S):
+        while "Searching" in (page := await text()):  # noqa: ASYNC110 - the page has no event for this
+            await asyncio.sleep(0.01)
+    return page
+
+
+async def test_a_broker_with_a_password_is_searched_after_a_login(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("bms_estimator.setup.search.LISTEN_S", 0.5)
+    broker = closed_broker(tmp_path).start()
+    login = {"url": broker.url, "username": "owner"}
+    try:
+        async with SetupServer(loopback(), tmp_path / "pack.toml") as server, ClientSession() as client:
+            page = await page_after(client, server.url, "search", places=broker.url)
+            assert f"Log in at {broker.url}" in page
+            page = await page_after(client, server.url, "login", **login, password="wrong")
+            assert "user name or password wrong" in page
+            page = await page_after(client, server.url, "login", **login, password=PASSWORD)
+            assert f"{broker.url}: no message of a known publisher" in page
+            again = re.search(r"rows=\"4\">([^<]*)<", page)
+            assert again  # the place without its password, which the server adds again
+            page = await page_after(client, server.url, "search", places=again[1])
+            assert f"{broker.url}: no message of a known publisher" in page
+            assert PASSWORD not in page
+    finally:
+        broker.stop()
+
+
 async def test_a_failed_search_is_reported_and_can_be_repeated(tmp_path: Path) -> None:
     async with SetupServer(loopback(), tmp_path / "pack.toml") as server, ClientSession() as client:
-
-        async def text() -> str:
-            async with client.get(server.url) as answer:
-                return await answer.text()
-
-        key = re.search('name="form_key" value="([^"]*)"', await text())
-        assert key
-        await client.post(f"{server.url}search", data={"places": "gx:0 mqtt://user:secret@gx", "form_key": key[1]})
-        async with asyncio.timeout(LONG_S):
-            while "Searching" in (page := await text()):  # noqa: ASYNC110 - the page has no event for this
-                await asyncio.sleep(0.01)
+        page = await page_after(client, server.url, "search", places="gx:0 mqtt://user:secret@gx")
     assert "gx:0: must be a host" in page
     assert "Search again" in page
     assert "secret" not in page

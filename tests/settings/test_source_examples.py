@@ -13,13 +13,17 @@ from bms_estimator.sources.factory import make_line_producer
 DOCS = Path(__file__).parents[2] / "docs" / "pack"
 EXAMPLES = [
     (document.name, text)
-    for document in sorted(DOCS.glob("*.md"))
+    for document in sorted([*DOCS.glob("*.md"), *(DOCS.parent / "start").glob("*.md"), DOCS.parents[1] / "README.md"])
     for text in re.findall(r"```toml\n(.*?)```", document.read_text(encoding="utf-8"), flags=re.DOTALL)
 ]
 
 
 @pytest.mark.parametrize(("document", "text"), EXAMPLES, ids=lambda value: value[:30])
-def test_a_documented_example_is_accepted(document: str, text: str) -> None:
+def test_a_documented_example_is_accepted(
+    document: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mqtt-password").write_text("secret")
     tables = tomllib.loads(text)
     settings = Settings.model_validate(tables)
     # Each example configures a source or a sensor.

@@ -2,7 +2,7 @@
 
 import pytest
 
-from bms_estimator.setup.series_count import cell_voltages, possible_counts, suggest_count
+from bms_estimator.setup.questions import cell_voltages, possible_counts, suggest_count
 
 
 @pytest.mark.parametrize(

@@ -128,10 +128,10 @@ class Summary:
         self._last = trace[-1].copy()
         self._soc_known = bool(known_rows(trace, self._soc_known)[-1])
         self._row_count += trace.size
-        soc_difference = trace["soc"] - trace["soc_coulomb"]
-        self._innovation_sum += float(trace["innovation_v"] @ trace["innovation_v"])
-        self._tracking_sum += float(trace["tracking_error_v"] @ trace["tracking_error_v"])
-        self._soc_difference_sum += float(soc_difference @ soc_difference)
+        # not by @, because BLAS would use several threads for these sums, and wait for them on a busy machine
+        self._innovation_sum += float(np.square(trace["innovation_v"]).sum())
+        self._tracking_sum += float(np.square(trace["tracking_error_v"]).sum())
+        self._soc_difference_sum += float(np.square(trace["soc"] - trace["soc_coulomb"]).sum())
 
     def result(self, pack: Pack, short_limit_a: float, sample_count: int, wall_s: float) -> ReplayResult:
         """Return the result of the replay, without ``impossible`` and ``temperatures_dropped``, which the caller sets.

@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -85,6 +85,10 @@ def accuracy(
         window, present_std, full_charges = _use_of_pack(settings, model)
     if between is not None:
         window = _with_ends(window, *between)
+    elif window.high - window.low < MIN_WINDOW:
+        raise UserError(
+            f"{pack}: the history has a use from {window.low:.0%} to {window.high:.0%} only; give --between LOW HIGH"
+        )
     curves = CellCurves(make_estimator(settings, model).cell_file_settings)
     best = Accuracy(curves, window)
     result = AccuracyResult(
@@ -103,29 +107,27 @@ def _with_ends(window: Window, low: float, high: float) -> Window:
         raise UserError(
             f"--between {low:g} {high:g}: give two SOCs from 0 to 100 with a distance of at least {MIN_WINDOW:.0%}"
         )
-    return Window(low / 100.0, high / 100.0, full=high == 100.0, has_temperature=window.has_temperature)
+    return replace(window, low=low / 100.0, high=high / 100.0, full=high == 100.0, charge_seen=True)
 
 
 def _use_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, int]:
     """Return the window of a pack's history, the std of its SOC, and its number of full charges.
 
+    Without a history the window is empty.
+
     Raises:
-        UserError: No checkpoint, or a history of a use that is too small.
+        UserError: There is no checkpoint.
     """
-    files = StateFiles(state_folder(settings), settings, model)
-    saved = files.saved_pack().pack
-    if saved.slow_fit is None or saved.slow_fit.history.rows.size == 0:
-        raise UserError(f"{files.history.path}: no history of the use yet; give --between LOW HIGH")
-    rows, fit = saved.slow_fit.history.rows, saved.slow_fit.saved_fit
+    saved = StateFiles(state_folder(settings), settings, model).saved_pack().pack
+    slow_fit, has_temperature = saved.slow_fit, bool(saved.estimator.record[0]["filter"]["sensed"])
+    if slow_fit is None or slow_fit.history.rows.size == 0:
+        return Window(0.0, 0.0, has_temperature=has_temperature), saved.estimator.soc_std, 0
+    rows, fit = slow_fit.history.rows, slow_fit.saved_fit
     soc = np.clip(rows["soc"] if fit is None else fit.row_soc, 0.0, 1.0)
     full_charges = int((rows["reference_kind"] == FULL).sum())
-    has_temperature = bool(saved.estimator.record[0]["filter"]["sensed"])
-    low, high = float(soc.min()), float(soc.max())
-    if high - low < MIN_WINDOW:
-        raise UserError(f"{files.history.path}: a use from {low:.0%} to {high:.0%} only; give --between LOW HIGH")
     is_charge_seen = bool((rows["current_a"] < 0.0).any())
-    window = Window(low, high, full_charges > 0, is_charge_seen, has_temperature)
-    return window, float(saved.estimator.soc_std), full_charges
+    window = Window(float(soc.min()), float(soc.max()), full_charges > 0, is_charge_seen, has_temperature)
+    return window, saved.estimator.soc_std, full_charges
 
 
 def _print(result: AccuracyResult) -> None:

@@ -13,9 +13,15 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from bms_estimator.fleet.packs.pack_type import Digest
+from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.saved import Arrays, curve_arrays, fit_of_curves
 
+COMPARED = np.dtype(
+    [("soc", "f8"), ("filter_soc", "f8"), ("deviation_std", "f8"), ("mean", "f8", 2), ("covariance", "f8", (2, 2))],
+    align=True,
+)
+"""Record of a ``ComparedCell``, with the same fields."""
 MAGIC = b"BMSF"
 """First bytes of the result of a fit; those of a block differ."""
 
@@ -66,6 +72,12 @@ class FitResult(NamedTuple):
     """The fit; None if it failed."""
     min_filter_std: float = 0.0
     """Std of the filter's SOC from which on the fit is adopted."""
+    weakest: ComparedCell | None = None
+    """Weakest cell of a bank by the discharges since the previous fit; None: no discharge shows it."""
+
+
+_WEAKEST = "weakest_"
+"""Prefix of the arrays of ``FitResult.weakest``."""
 
 
 def to_bytes(arrays: Mapping[str, Any]) -> bytes:
@@ -129,6 +141,8 @@ def encode_result(result: FitResult) -> bytes:
         "is_exchanged": np.bool_(fit is not None and fit.is_exchanged),
         "min_filter_std": np.float64(result.min_filter_std),
     }
+    if result.weakest is not None:
+        arrays |= {f"{_WEAKEST}{name}": np.asarray(value) for name, value in vars(result.weakest).items()}
     return MAGIC + to_bytes(arrays)
 
 
@@ -145,10 +159,29 @@ def decode_result(data: bytes) -> FitResult:
         )
     except KeyError as error:
         raise ValueError(f"not the result of a fit: {error} is missing") from None
+    weakest = _weakest({name: arrays.pop(name) for name in list(arrays) if name.startswith(_WEAKEST)})
     fit = fit_of_curves(arrays)
     return FitResult(
         int(request),
         bool(is_fitted),
         None if fit is None else replace(fit, is_exchanged=bool(is_exchanged)),
         float(min_filter_std),
+        weakest,
     )
+
+
+def _weakest(arrays: Arrays) -> ComparedCell | None:
+    """Return the decoded weakest cell; None without arrays.
+
+    Raises:
+        ValueError: An array is damaged.
+    """
+    if not arrays:
+        return None
+    values = [arrays.get(f"{_WEAKEST}{name}", np.zeros(0)) for name in COMPARED.names or ()]
+    if [each.shape for each in values] != [COMPARED[name].shape for name in COMPARED.names or ()]:
+        raise ValueError("the weakest cell is damaged")
+    if not all(np.isfinite(each).all() for each in values):
+        raise ValueError("the weakest cell has a value that is not finite")
+    soc, filter_soc, deviation_std, mean, covariance = values
+    return ComparedCell(float(soc), float(filter_soc), float(deviation_std), mean, covariance)

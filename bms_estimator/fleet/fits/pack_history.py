@@ -17,6 +17,8 @@ from bms_estimator.fleet.fits.messages import (
     position_of,
     to_bytes,
 )
+from bms_estimator.pack_model.bank_comparison import ComparedCell
+from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit, fit
 from bms_estimator.pack_model.history import History
@@ -91,6 +93,7 @@ class PackHistory:
         rows, previous, self.answered = self._history.rows, self._last_fit, request
         if not has_enough_data(rows, self._new_rows, previous):
             return FitResult(request, is_fitted=False)
+        weakest = None if previous is None else self._weakest(cell, previous)
         self._new_rows = 0
         try:
             fitted = fit(cell, rows, previous)
@@ -98,9 +101,20 @@ class PackHistory:
             self._failures += 1
             if self._failures == MAX_FAILED_FITS:
                 self._reset()
-            return FitResult(request, is_fitted=True, min_filter_std=np.inf)
+            return FitResult(request, is_fitted=True, min_filter_std=np.inf, weakest=weakest)
         self._last_fit, self._failures = fitted, 0
-        return FitResult(request, True, fitted, min_filter_std(fitted, rows))
+        return FitResult(request, True, fitted, min_filter_std(fitted, rows), weakest)
+
+    def _weakest(self, cell: CellCurves, previous: PackFit) -> ComparedCell | None:
+        """Compare the discharges since the previous fit with earlier ones. Return the weakest cell of a bank; None if unknown."""
+        if cell.series <= 1.0:
+            return None
+        monitor = BankMonitor(cell)
+        try:
+            monitor.add(self._history, self._new_rows, previous)
+        except Exception:  # noqa: BLE001 - an odd value of the history must not prevent the fit
+            return None
+        return monitor.weakest
 
     def to_bytes(self) -> bytes:
         """Encode the whole history for ``add``."""

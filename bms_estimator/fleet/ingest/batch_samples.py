@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.edge.cell_voltages import MAX_CELLS
 from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values, check_count
-from bms_estimator.fleet.worker.block_checks import MAX_AHEAD_S
+from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import (

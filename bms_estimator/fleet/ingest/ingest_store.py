@@ -29,8 +29,7 @@ from bms_estimator.fleet.ingest.store_table import (
     Progress,
     read_state,
 )
-from bms_estimator.fleet.worker.block_checks import last_sample_s
-from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY
+from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, last_sample_s
 from bms_estimator.process.tasks import end
 from bms_estimator.store.database import Database, StoreError
 

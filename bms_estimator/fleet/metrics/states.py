@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from bms_estimator.fleet.heartbeat import Heartbeat
 
@@ -21,6 +22,15 @@ class StreamState:
     max_bytes: int | None = None
 
 
+class Problems(NamedTuple):
+    """Numbers of packs of the table."""
+
+    silent: int
+    """Packs without a summary for the time ``arrival_watch.SILENT_S``."""
+    alarms: int
+    """Packs with raised alarms at the end of the last hour."""
+
+
 @dataclass(frozen=True)
 class TenantState:
     """Workers and streams of a tenant.
@@ -30,14 +40,14 @@ class TenantState:
         undelivered: Number of undelivered messages by partition; None: the server does not answer.
         streams: Streams and buckets by name; None: the server does not answer.
         unsaved_share: Part of the stream ``RAW`` that no checkpoint includes (``unsaved_blocks``); None before the first check.
-        silent: Number of packs of the table without a recent summary (``arrival_watch``); None before the first check.
+        problems: Numbers of packs without a recent summary, and with alarms in the last one; None before the first check.
     """
 
     heartbeats: tuple[Heartbeat, ...] = ()
     undelivered: Mapping[int, int] | None = None
     streams: Mapping[str, StreamState] | None = None
     unsaved_share: float | None = None
-    silent: int | None = None
+    problems: Problems | None = None
 
     @property
     def unowned(self) -> frozenset[int] | None:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +18,18 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.kernels.alarms import BROKEN_WIRE_V, LIMITS, NAMES, SETTINGS
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, assemble
 from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.settings.alarm_limits import short_limit_a
+from bms_estimator.settings.alarm_limits import AlarmDefinition, min_charge_current_a, monitored_alarms, short_limit_a
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sampling import NO_LIMITS
+from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS
+from bms_estimator.telemetry.alarms.evaluator import SENSOR_SUSPECTS
+from bms_estimator.telemetry.alarms.inputs import QUANTITIES
+from bms_estimator.telemetry.impossible import PackBounds
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
 
 MAX_TYPES = 256
@@ -31,6 +37,62 @@ MAX_TYPES = 256
 Bytes = NDArray[np.uint8]
 Digest = tuple[int, int]
 """First 128 bits of a SHA-256 digest as two words."""
+
+
+class AlarmDefinitions(NamedTuple):
+    """Alarms that a worker evaluates for the packs of a type."""
+
+    by_position: dict[int, AlarmDefinition]
+    """Definition of each monitored alarm by its position in ``kernels.alarms.NAMES``."""
+    limits: NDArray[np.void]
+    """Shape (number of ``NAMES``,), dtype ``kernels.alarms.LIMITS``."""
+    settings: NDArray[np.void]
+    """Shape (1,), dtype ``kernels.alarms.SETTINGS``."""
+    bounds: PackBounds
+
+    @classmethod
+    def of(cls, settings: Settings, model: PackModel, gap_s: float) -> Self:
+        """Return the definitions for settings and model of a whole pack.
+
+        Args:
+            settings: Settings of the pack.
+            model: Model of the whole pack.
+            gap_s: Minimum length of a gap between samples [s].
+
+        Raises:
+            UserError: A clear level lies beyond its limit.
+        """
+        monitored = {each.name: each for each in monitored_alarms(settings, model)}
+        by_position = {k: monitored[name] for k, name in enumerate(NAMES) if name in monitored}
+        limits, bounds = np.zeros(len(NAMES), LIMITS), PackBounds.of(model)
+        for k, each in by_position.items():
+            needs = sum(1 << QUANTITIES.index(name) for name in each.kind.needs)
+            sign = 1.0 if each.kind.is_upper_limit else -1.0
+            numbers = (each.limit, each.clear, each.delay_s, each.clear_delay_s)
+            limits[k] = (1, each.severity == "critical", sign, *numbers, needs)
+        broken_v, n = BROKEN_WIRE_V * bounds.series, bounds.series
+
+        def limit(name: str, default: float) -> float:
+            return monitored[name].limit if name in monitored else default
+
+        values: dict[str, Any] = {
+            "gap_s": gap_s,
+            "lost_s": settings.alarms.lost_s,
+            "charging_a": min_charge_current_a(model),
+            "series": n,
+            "max_a": bounds.max_a,
+            "range_a": bounds.range_a,
+            "low_v": bounds.range_v[0],
+            "high_v": bounds.range_v[1],
+            "wire_v": limit("pack_under_voltage", broken_v),
+            "wire_low_cell_v": limit("cell_under_voltage", BROKEN_WIRE_V),
+            "wire_high_cell_v": limit("cell_over_voltage", np.inf),
+        }
+        values |= {"sensor_suspects": int(SENSOR_SUSPECTS), "model_suspects": int(MODEL_SUSPECTS)}
+        record = np.zeros(1, SETTINGS)
+        for name, value in values.items():
+            record[name] = value
+        return cls(by_position, limits, record, bounds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +104,7 @@ class PackType:
         config_digest: Digest of the configuration of the estimator. A state of another digest is migrated.
         state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
         pack: Pack whose estimator is bound to the unpacked record of the partition, without forecasts.
+        alarms: Definitions of the alarms.
         short_limit_a: Minimum proven self-discharge of a cell with an internal short [A].
         meter: Charge and energy meter bound to the unpacked record.
         capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
@@ -54,6 +117,7 @@ class PackType:
     config_digest: Digest
     state_digest: Digest
     pack: Pack
+    alarms: AlarmDefinitions
     short_limit_a: float
     meter: ChargeEnergyMeter
     capacity_ah: float | None
@@ -180,6 +244,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], adv
         config_digest=digest,
         state_digest=state_digest(settings, cell),
         pack=assemble(estimator, settings, new_fit, has_load=False),
+        alarms=AlarmDefinitions.of(settings, cell, float(estimator.settings["gap_s"][0])),
         short_limit_a=short_limit_a(settings, cell),
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,

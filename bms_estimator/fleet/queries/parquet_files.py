@@ -49,6 +49,7 @@ def _column(annotation: object) -> pa.DataType:
     """Return the column type. Single precision exceeds the accuracy of any value, and halves the size of the files."""
     types: dict[object, pa.DataType] = {
         str: pa.string(),
+        str | None: pa.string(),
         int: pa.int32(),
         int | None: pa.int64(),
         list[float] | None: pa.list_(pa.float32()),

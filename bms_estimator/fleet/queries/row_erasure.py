@@ -27,7 +27,7 @@ from bms_estimator.fleet.queries.parquet_files import (
 )
 
 MAX_BEHIND_H = 366 * 24
-"""Maximum age of a plausible hour [h], as ``worker.block_checks.MAX_BEHIND_S``."""
+"""Maximum age of a plausible hour [h], as ``worker.block_order.MAX_BEHIND_S``."""
 
 
 def erase_rows(folder: Path, packs: Collection[str]) -> int:

@@ -1,11 +1,13 @@
 """Supervisor of a nats-server as a child process: start, creation of streams, reload of settings, forwarding of signals.
 
-The child ends with this process, even if this process is killed. After a failure, systemd restarts both.
+The child ends with this process, even if this process is killed. After a failure, systemd restarts both. Each connection of an
+edge needs an open file, whose limit is checked.
 """
 
 import asyncio
 import contextlib
 import functools
+import resource
 import shutil
 import signal
 from collections.abc import AsyncIterator, Callable, Mapping
@@ -23,11 +25,30 @@ from bms_estimator.fleet.server.monitor import POLL_S, is_healthy, query_monitor
 from bms_estimator.fleet.server.nats_config import Node, configuration
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check_node_disk, check_tls_files, node_of
 from bms_estimator.fleet.server.node_watch import NodeWatch
-from bms_estimator.fleet.server.open_files import warn_of_open_file_limit
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.child_process import ends_with_us, find_server
 from bms_estimator.process.private_file import write_private
+from bms_estimator.settings.fleet import FleetSettings
+
+OTHER_FILES = 1000
+"""Number of open files besides the connections of edges: files of the streams and connections of workers."""
+
+
+def warn_of_open_file_limit(settings: FleetSettings) -> None:
+    """Log a warning if the limit of open files is too small for a connection of each pack's edge.
+
+    The hard limit counts, because nats-server raises its soft limit to it.
+    """
+    packs = sum(tenant.packs or settings.server.packs for tenant in settings.tenants_or_default.values())
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    if limit != resource.RLIM_INFINITY and limit < packs + OTHER_FILES:
+        log.warning(
+            "the limit of open files is too small for all edges: increase LimitNOFILE of the systemd unit, or ulimit -n",
+            packs=packs,
+            limit=limit,
+        )
+
 
 log = structlog.get_logger(__name__)
 

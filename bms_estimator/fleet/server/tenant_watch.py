@@ -1,4 +1,7 @@
-"""Watch over one tenant: heartbeats of its workers, its streams, unsaved blocks, and silent packs."""
+"""Watch over one tenant: heartbeats of its workers, its streams, undelivered messages, unsaved blocks, and silent packs and alarms.
+
+A worker publishes the summary of an hour when the pack's next hour begins.
+"""
 
 import asyncio
 import contextlib
@@ -9,20 +12,87 @@ import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
+from nats.js.api import ConsumerInfo
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fleet_workers import FleetWorkers
 from bms_estimator.fleet.heartbeat import Heartbeat
-from bms_estimator.fleet.metrics.states import StreamState, TenantState
-from bms_estimator.fleet.nats.backlog import undelivered_messages
+from bms_estimator.fleet.metrics.states import Problems, StreamState, TenantState
+from bms_estimator.fleet.nats.bucket_reader import BucketReader
 from bms_estimator.fleet.nats.connection import close
-from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S
+from bms_estimator.fleet.nats.stream_reader import StreamError, read_stream
+from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S, consumer
 from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
-from bms_estimator.fleet.server.arrival_watch import ArrivalWatch
 from bms_estimator.fleet.server.local_client import connect
 from bms_estimator.fleet.server.nats_config import Node
+
+SILENT_S = 3.0 * 3600.0
+"""Time without a summary after which a pack counts as silent [s], about that of the query ``silent``."""
+
+
+ALARMS = b'"alarms":"'
+"""Part of a summary with raised alarms; other summaries do not have the field."""
+
+
+class ArrivalWatch:
+    """Watch over the arrival of summaries; times are of one monotonic clock [s].
+
+    A pack without a summary counts from the start of the watch, or from its addition to the table.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+    """
+
+    def __init__(self, nc: Client) -> None:
+        self._nc, self._table = nc, BucketReader(nc, subjects.PACKS_BUCKET)
+        self._last_s: dict[str, float] = {}  # by pack of the table
+        self._with_alarms = set[str]()
+        self._next_sequence: int | None = None  # in the stream ``HOURS``
+
+    async def problems(self, now_s: float) -> Problems:
+        """Read the changes since the last call, and return the present numbers.
+
+        Raises:
+            StreamError: The server does not respond or rejects a request.
+            nats.errors.Error: An error of the connection.
+        """
+
+        def set_row(pack: str, row: bytes | None) -> None:
+            if row is None:
+                self._last_s.pop(pack, None)
+                self._with_alarms.discard(pack)
+            else:
+                self._last_s.setdefault(pack, now_s)
+
+        await self._table.read(set_row)
+        if self._next_sequence is None:
+            state = (await self._nc.jetstream().stream_info(subjects.HOURS_STREAM)).state
+            self._next_sequence = state.last_seq + 1
+        rows = read_stream(self._nc, subjects.HOURS_STREAM, subjects.hours(), first=self._next_sequence)
+        async for batch in rows:
+            for message in batch:
+                pack = message.subject.rpartition(".")[2]
+                if pack in self._last_s:
+                    self._last_s[pack] = now_s
+                    (self._with_alarms.add if ALARMS in message.data else self._with_alarms.discard)(pack)
+            self._next_sequence = batch[-1].sequence + 1
+        return Problems(sum(now_s - last_s > SILENT_S for last_s in self._last_s.values()), len(self._with_alarms))
+
+
+async def undelivered_messages(nc: Client, partitions: int) -> dict[int, int]:
+    """Return the number of undelivered messages of each partition.
+
+    Raises:
+        nats.errors.Error: The server does not respond, or has no stream ``RAW``.
+    """
+    js = nc.jetstream(timeout=RESPONSE_TIMEOUT_S)
+    consumers = dict[str, ConsumerInfo]()
+    while page := await js.consumers_info(subjects.RAW_STREAM, offset=len(consumers)):
+        consumers |= {info.name: info for info in page}
+    named = {number: consumers.get(consumer(number)) for number in range(partitions)}
+    return {number: info.num_pending or 0 for number, info in named.items() if info}
+
 
 CHECK_S = 60.0
 """Interval between two checks for unsaved blocks and silent packs [s]."""
@@ -48,7 +118,7 @@ class TenantWatch:
         self._workers = FleetWorkers(node.partitions, LAG_WINDOW_S)
         self._nc: Client | None = None
         self._unsaved_share: float | None = None
-        self._silent: int | None = None
+        self._problems: Problems | None = None
 
     async def run(self) -> None:
         """Receive heartbeats, and log a warning while more than half of the stream is unsaved, until cancelled."""
@@ -86,7 +156,7 @@ class TenantWatch:
             )
             for info in infos
         }
-        return TenantState(heartbeats, undelivered, streams, self._unsaved_share, self._silent)
+        return TenantState(heartbeats, undelivered, streams, self._unsaved_share, self._problems)
 
     async def _watch_until_disconnected(self) -> None:
         """Connect, and watch until the connection has ended."""
@@ -100,7 +170,7 @@ class TenantWatch:
             await nc.subscribe(subjects.worker(), cb=self._receive)
             await self._check_periodically(nc, closed)
         finally:
-            self._nc = self._unsaved_share = self._silent = None
+            self._nc = self._unsaved_share = self._problems = None
             self._workers.clear()
             await close(nc)
 
@@ -108,7 +178,7 @@ class TenantWatch:
         """Compute the unsaved share and the silent packs periodically until the connection has ended."""
         arrivals = ArrivalWatch(nc)
         while not closed.is_set():
-            self._silent = await arrivals.silent_packs(time.monotonic())
+            self._problems = await arrivals.problems(time.monotonic())
             unsaved = await unsaved_blocks(nc, range(self._node.partitions))
             self._unsaved_share = unsaved.share
             if unsaved.warning:

@@ -10,10 +10,10 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from bms_estimator.fleet.worker.block_result import ResultPublisher
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
-from bms_estimator.fleet.worker.replay_guard import ReplayGuard
-from bms_estimator.fleet.worker.result_publisher import ResultPublisher
 from bms_estimator.fleet.worker.retry import Attempt
+from bms_estimator.fleet.worker.takeover import ReplayGuard
 
 SLICE_S = 0.004
 """Duration of a slice [s], after which the event loop sends heartbeats and receives messages. The last message of a slice may

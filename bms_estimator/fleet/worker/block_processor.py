@@ -10,13 +10,15 @@ from numpy.typing import NDArray
 from bms_estimator.checkpoint.arrays_file import without_observer
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.fleet.fits.messages import FitResult
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType, PackTypes
 from bms_estimator.fleet.worker import hour_summary
-from bms_estimator.fleet.worker.block_checks import MAX_TIMESTAMP_S, Arrival, clock_error_s
+from bms_estimator.fleet.worker.block_order import MAX_TIMESTAMP_S, Arrival, clock_error_s
 from bms_estimator.fleet.worker.block_result import BlockResult
+from bms_estimator.fleet.worker.pack_alarms import PackAlarms
 from bms_estimator.fleet.worker.pack_fits import PackFits
 from bms_estimator.fleet.worker.pack_state import (
     CONFIG_DIGEST,
@@ -69,7 +71,7 @@ class BlockProcessor:
     def __init__(self, unpacked: UnpackedRecord, counters: Counter[str], wall: Callable[[], float]) -> None:
         record = unpacked.record
         self._record, self._counters, self._wall = record, counters, wall
-        self._unpacked, self._fits = unpacked, PackFits(record, counters)
+        self._unpacked, self._fits, self._alarms = unpacked, PackFits(record, counters), PackAlarms(record)
         self.types = PackTypes(record, self._fits.advance)
         self._delivery, self._charge_energy, self._hour = (record[0][name] for name in ("delivery", "flow", "hour"))
         self._observer = record[0]["estimator"]["observer"]
@@ -95,20 +97,28 @@ class BlockProcessor:
         self._load_cells(pack_type)
         rows, is_new_hour = self._roll_over_hour(pack, block, arrival, pack_type)
         self._check_clock(block, arrival)
+        is_new_time_base = int(self._delivery[LAST_STORE_NS]) != block.store_created_ns
+        self._alarms.begin_block(pack_type, is_new_time_base=is_new_time_base)
         self._resume_after_store_change(pack_type, block)
         # another pack may have used the window meanwhile
         self._window.previous_end_s = float(self._observer["time_s"]) if self._observer["started"] else math.nan
-        self._window.soc_known = False
+        self._window.soc_known = self._alarms.is_soc_known
         self._record_last_sample(block)
         arrival_s, now_s = self._arrival_s(block), self._wall()
-        self._estimate(block, pack_type, arrival_s)
+        trace = self._estimate(block, pack_type, arrival_s)
         state = self._state_payload(pack_type, now_s)
         parameters = cells = None
         if is_new_hour and state is not None:
             parameters = self._parameters_payload(pack_type.estimator, arrival_s, now_s)
             cells = self._cells_payload(pack_type, now_s)
         return BlockResult(
-            pack, state=state, parameters=parameters, cells=cells, hours=rows, history=self._fits.take_messages()
+            pack,
+            state=state,
+            parameters=parameters,
+            cells=cells,
+            alarms=self._alarms.messages(pack_type, trace, now_s, is_whole=is_new_hour),
+            hours=rows,
+            history=self._fits.take_messages(),
         )
 
     def receive_fit(self, result: FitResult, sequence: int, pack_type: PackType) -> bool:
@@ -187,8 +197,11 @@ class BlockProcessor:
             pack_type.estimator.resume(gap_s)
             pack_type.cells.resume(gap_s)
 
-    def _estimate(self, block: Block, pack_type: PackType, arrival_s: float) -> None:
-        """Estimate the samples; add the estimates to the hour, the charge and energy meter and the publish window."""
+    def _estimate(self, block: Block, pack_type: PackType, arrival_s: float) -> TraceBlock:
+        """Estimate the samples; add the estimates to the hour, the charge and energy meter and the publish window.
+
+        Evaluate the alarms. Return the last estimates.
+        """
         observer, counters, cells = self._observer, self._counters, pack_type.cells
         accepted_before, steps_back_before = int(observer["samples"]), int(observer["time_steps_back"])
         pack_type.meter.continue_from(
@@ -196,12 +209,14 @@ class BlockProcessor:
         )
         is_complete = block.cells_v.shape[1] == cells.estimated_cells <= MAX_CELLS
         cells_v = block.cells_v if is_complete else NO_CELLS
+        wall_offset_s = arrival_s - float(self._delivery["last_s"])
         for start in range(0, block.samples.size, MAX_PART_SAMPLES):
             part = slice(start, start + MAX_PART_SAMPLES)
             samples, trace = block.samples[part], pack_type.pack.run(block.samples[part], cells_v[part]).trace
             hour_summary.add(self._record["hour"], trace, samples.size, block.store_created_ns, pack_type.estimator)
             pack_type.meter.add(trace)
             self._window.add(trace, arrival_s, known_voltages(block.cells_v[part]))
+            self._alarms.add(pack_type, samples, block.cells_v[part], trace, wall_offset_s)
         if cells.cells.size != self._unpacked.cell_count:  # the first block with cell voltages
             self._unpacked.start_cells(cells.cells.size)
             self._unpacked.cells[...], self._unpacked.bank[...] = cells.cells, cells.bank
@@ -209,6 +224,7 @@ class BlockProcessor:
         counters["samples"] += block.samples.size
         counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted_before)
         counters["time_steps_back"] += int(observer["time_steps_back"]) - steps_back_before
+        return trace
 
     def _state_payload(self, pack_type: PackType, now_s: float) -> bytes | None:
         """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
@@ -282,7 +298,8 @@ class BlockProcessor:
         if current:
             settings = pack_type.settings.model_copy(update={"name": pack})
             row = hour_summary.row(settings, current, self._record["hour"], pack_type.estimator)
-            row = row.model_copy(update=hour_summary.cell_fields(pack_type.cells.deviations) | self._origin(arrival))
+            cells, alarms = pack_type.cells.deviations, {"alarms": " ".join(self._alarms.raised) or None}
+            row = row.model_copy(update=hour_summary.cell_fields(cells) | alarms | self._origin(arrival))
             # the collector sets missing values to null, so that a pack without cell voltages has a shorter row
             rows = ((f"{pack}.{current}.{arrival.sequence}", row.model_dump_json(exclude_defaults=True).encode()),)
         hour_summary.begin(self._record["hour"], self._record[0]["estimator"])

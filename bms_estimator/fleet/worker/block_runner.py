@@ -1,7 +1,7 @@
 """Runner of the messages of one partition.
 
 A worker processes one message at a time. The processor time is charged to the pack. In a guarded replay, a block that kills workers
-is found and skipped (``replay_guard``).
+is found and skipped (``takeover``).
 """
 
 import asyncio
@@ -16,13 +16,10 @@ from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.table_change import is_change
-from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, BlockResult
+from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, BlockResult, ResultPublisher
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage
-from bms_estimator.fleet.worker.raw_messages import is_block
-from bms_estimator.fleet.worker.replay_guard import ReplayGuard
-from bms_estimator.fleet.worker.result_publisher import ResultPublisher
-from bms_estimator.fleet.worker.table_change_sender import TableChangeSender
+from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, is_block
+from bms_estimator.fleet.worker.takeover import ReplayGuard
 
 MAX_CPU_FRACTION = 0.1
 """Fraction of a core that a pack may use continuously. A source at 1,000 Hz needs 0.005."""
@@ -80,7 +77,7 @@ class BlockRunner:
         step_lock: Lock of the worker (``BlockLoop``), held while a block is processed.
         guard: Guard of the partition.
         results: Publisher of summaries and dead letters.
-        changes: Sender of changes of the table.
+        on_table_change: Called with the pack after its row of the table has changed.
         save: Writes a checkpoint.
         on_deferred: Called after a message was deferred.
 
@@ -100,14 +97,14 @@ class BlockRunner:
         step_lock: asyncio.Lock,
         guard: ReplayGuard,
         results: ResultPublisher,
-        changes: TableChangeSender,
         *,
         save: Callable[[], Awaitable[None]],
         on_deferred: Callable[[], None],
+        on_table_change: Callable[[str], None],
     ) -> None:
         self._number, self._partitions, self._worker, self._step_lock = number, partitions, worker, step_lock
-        self._guard, self._results, self._changes = guard, results, changes
-        self._save, self._on_deferred = save, on_deferred
+        self._guard, self._results = guard, results
+        self._save, self._on_deferred, self._on_table_change = save, on_deferred, on_table_change
         self.budget = CpuBudget()
         self.blocks = self.samples = self.faults = self.dead_letters = 0
         self.lag_s: float | None = None
@@ -189,7 +186,7 @@ class BlockRunner:
         if result.dead_reason:
             self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
         if is_change(data):  # the table may have changed again since this change was sent
-            self._changes.add(pack)
+            self._on_table_change(pack)
         return result
 
     def count_block(self, data: bytes) -> None:

@@ -14,7 +14,7 @@ from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.estimator.identified_parameters import current_offset, relative_capacity, relative_series_resistance
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
-from bms_estimator.fleet.worker.block_checks import last_sample_s
+from bms_estimator.fleet.worker.block_order import last_sample_s
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, HOURLY_FIELDS, accumulate_hour
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.fits.messages import FitRequest, FitResult, Rows, RowsPosition, encode_rows
+from bms_estimator.fleet.fits.messages import COMPARED, FitRequest, FitResult, Rows, RowsPosition, encode_rows
 from bms_estimator.fleet.packs.pack_type import Bytes, PackType, WorkerFit, bytes_of
 from bms_estimator.fleet.worker.block_result import HistoryMessage
 from bms_estimator.fleet.worker.pack_state import PACK_FIT
 from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, FREE_ROWS
+from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import adopt_curves
 from bms_estimator.pack_model.learning import ADOPT_DELAY_S, fit_interval
@@ -68,6 +69,8 @@ class PackFits:
             pack_type: Type of the pack.
             sequence: Stream sequence number of the block.
         """
+        if isinstance(slow_fit := pack_type.pack.slow_fit, WorkerFit) and slow_fit.bank:
+            slow_fit.bank.weakest = weakest_of_record(self._fit)
         self._pack, self._digest, self._sequence, self._messages = pack, pack_type.state_digest, sequence, []
         if pack_type.pack.slow_fit and not self._h["enabled"]:
             pack_type.estimator.schedule(self._h["elapsed_s"] + pack_type.pack.slow_fit.interval())
@@ -105,6 +108,7 @@ class PackFits:
             slow_fit.estimator.schedule(begun_s + fit_interval(begun_s, slow_fit.interval_s))
             return True
         write_fit(fit["received"], result, sequence)
+        write_weakest(fit, result)
         if h["event_s"] > fit["begun_s"] + ADOPT_DELAY_S:
             slow_fit.estimator.schedule(h["elapsed_s"])  # it is late: adopt it at the next sample
         return True
@@ -158,6 +162,21 @@ def write_fit(record: np.void, result: FitResult, sequence: int) -> None:
     for name, value in curve_arrays(result.fit).items():
         record[name] = value
     record["is_exchanged"] = result.fit is not None and result.fit.is_exchanged
+
+
+def write_weakest(record: np.void, result: FitResult) -> None:
+    """Write the weakest cell of a bank to a record of dtype ``FIT``. The cell of an exchanged bank is dropped."""
+    if result.weakest is not None:
+        record["has_weakest"] = 1
+        for name, value in vars(result.weakest).items():
+            record["weakest"][name] = value
+    elif result.fit is not None and result.fit.is_exchanged:
+        record["has_weakest"] = 0
+
+
+def weakest_of_record(record: np.void) -> ComparedCell | None:
+    """Return the weakest cell in a record of dtype ``FIT``; None if it is unknown."""
+    return ComparedCell(*(record["weakest"][name] for name in COMPARED.names or ())) if record["has_weakest"] else None
 
 
 def fit_of_record(record: np.void) -> PackFit:

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.restore import copy_known_fields
+from bms_estimator.fleet.fits.messages import COMPARED
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
+from bms_estimator.kernels.alarms import ALARMS
 from bms_estimator.kernels.cells.records import BANK, CELL
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
@@ -54,7 +56,7 @@ DELIVERY = np.dtype(
         ("last_s", "f8"),
         # current hour [hours since 1970]; 0: no block yet
         ("hour", "i8"),
-        # error of the edge's clock in the last block of this hour with an error beyond the limits of ``block_checks`` [s];
+        # error of the edge's clock in the last block of this hour with an error beyond the limits of ``block_order`` [s];
         # 0: none
         ("clock_error_s", "f8"),
         # ``PackType.config_digest`` of the settings with which the state was computed
@@ -98,6 +100,10 @@ FIT = np.dtype(
         ("in_force", PACK_FIT),
         # fit that waits for its adoption
         ("received", PACK_FIT),
+        # 1: ``weakest`` is known
+        ("has_weakest", "i8"),
+        # weakest cell of a bank by the last fits
+        ("weakest", COMPARED),
     ],
     align=True,
 )
@@ -108,6 +114,7 @@ PACK_STATE = np.dtype(
         ("flow", FLOW),
         ("hour", HOUR_SUMS),
         ("fit", FIT),
+        ("alarms", ALARMS),
         ("estimator", ESTIMATOR_STATE),
     ],
     align=True,

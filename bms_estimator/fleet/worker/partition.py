@@ -17,11 +17,12 @@ from bms_estimator.edge.block import Block, BlockError, BlockHeader, decode, dec
 from bms_estimator.fleet.fits.messages import decode_result, is_fit
 from bms_estimator.fleet.packs.pack_type import PackType
 from bms_estimator.fleet.packs.table_change import is_change
-from bms_estimator.fleet.worker.block_checks import Arrival, density_fault
 from bms_estimator.fleet.worker.block_order import (
+    Arrival,
     BlockOrder,
     UnsavedPositions,
     classify_block,
+    density_fault,
     edge_reply,
     mark_taken,
     position,
@@ -54,7 +55,7 @@ class Partition:
         sequence: Stream sequence number of the last processed or deferred message; 0: none.
         in_force: Table of packs that is in force at this position of the stream.
         deferred: Queue of packs with deferred messages.
-        clock_errors: Errors of edges' clocks beyond the limits of ``block_checks``, by pack [s], positive if ahead. A pack is
+        clock_errors: Errors of edges' clocks beyond the limits of ``block_order``, by pack [s], positive if ahead. A pack is
             listed from a block with an error until the end of this hour on its clock.
     """
 
@@ -99,7 +100,7 @@ class Partition:
         partition.in_force.restore(checkpoint.in_force)
         partition.sequence = checkpoint.sequence
         partition._counters.update(checkpoint.counters)
-        partition._records.restore(checkpoint)
+        partition._records.restore(checkpoint.packs, checkpoint.other_layouts)
         partition.deferred = Deferred(checkpoint.deferred)
         return partition
 
@@ -164,7 +165,7 @@ class Partition:
             sequence: Stream sequence number. A message that was already processed is counted and skipped.
             received_s: Server's clock at the arrival of the message [s since 1970]; None: unknown, so that the edge's clock
                 is not checked.
-            is_lethal: Skip the block, because it has killed workers (``replay_guard``).
+            is_lethal: Skip the block, because it has killed workers (``takeover``).
         """
         if sequence <= self.sequence:
             self._counters["repeated"] += 1

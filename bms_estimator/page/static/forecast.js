@@ -8,7 +8,7 @@ export const charts = {};
 /** Curves of the forecast: SOC and voltage with their 90 % bands, and the probability that the load is still on. */
 export function drawForecast({ topics: { forecast: report, state } }) {
 	const known = f.isNumber(state?.time_to_cutoff_s) && state.soc_known !== false, hasCurves = known && !!report?.elapsed_s?.length;
-	hide($("forecastcard"), state?.soc_known === false || (!known && !state?.forecast_reason));
+	hide($("forecastcard"), state?.soc_known === false || (!known && (!state?.forecast_reason || f.isNumber(state.time_to_full_s))));
 	text($("noforecast"), !known ? `No time to the cut-off: ${state?.forecast_reason}.` : hasCurves ? "" : "The curves follow within a minute.");
 	hide($("noforecast"), hasCurves);
 	hide($("forecast"), !hasCurves);

@@ -32,7 +32,7 @@ function draw() {
 	if (!pack) return;
 	const state = pack.topics.state ?? {};
 	drawHead(pack);
-	showWhatIf(connection.broker || !f.isNumber(state.soc) ? null : pack.name); // a dashboard, which has a link to a broker, makes no forecasts
+	showWhatIf(connection.broker || !f.isNumber(state.soc) || state.soc_known === false ? null : pack.name); // a dashboard, which has a link to a broker, makes no forecasts
 	drawAlarms(pack);
 	drawState(state, pack.topics.parameters?.state_of_health?.capacity);
 	drawForecastValues(state);

@@ -30,6 +30,7 @@ function capacityHealth(capacity) {
 export function drawState(state, capacity) {
 	const known = state.soc_known !== false, s = known ? { ...state } : { ...state, ...Object.fromEntries(UNCERTAIN.map((name) => [name, null])) };
 	s.time_left = s.time_to_cutoff_s ?? s.time_to_full_s;
+	if (!s.energy_out_kwh && !s.energy_in_kwh) s.energy_out_kwh = null; // nothing counted yet
 	s.capacity_health = capacity ? 1 : null;
 	const [label, left, band] = timeLeft(s), [health, note] = capacityHealth(capacity);
 	for (const [name, show] of Object.entries(SHOWN)) put(name, show(s[name]));

@@ -237,7 +237,7 @@ class SampleAssembler:
             time_s=self._value("time", now_s),
             voltage_held=voltage_held,
             current_held=current_held,
-            soc=(self._value("soc", now_s) or math.nan) / 100.0,
+            soc=math.nan if (percent := self._value("soc", now_s)) is None else percent / 100.0,
             capacity_ah=self._value("capacity", now_s) or math.nan,
         )
 

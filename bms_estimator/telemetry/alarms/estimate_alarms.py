@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import ForecastRows
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
+from bms_estimator.kernels.alarms import CELLS_GAP_S
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.alarms import AlarmName
@@ -15,9 +16,6 @@ from bms_estimator.telemetry.alarms.alarm_list import AlarmList
 from bms_estimator.telemetry.alarms.sample_intervals import SampleIntervals
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
 from bms_estimator.telemetry.state import UNKNOWN_SOC, known_margin, missing_margin_reason
-
-CELLS_GAP_S = 60.0
-"""Minimum length of a gap between two evaluations of the single cells [s]."""
 
 
 class CellAlarms:

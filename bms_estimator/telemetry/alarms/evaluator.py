@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
+from bms_estimator.kernels.alarms import BROKEN_WIRE_V, MAX_SPACING_FRACTION
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
@@ -23,7 +24,7 @@ from bms_estimator.settings.alarm_limits import STATE_LOST, AlarmDefinition
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList, find_unwatched
 from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, CellAlarms, EstimateAlarms
-from bms_estimator.telemetry.alarms.inputs import MAX_SPACING_FRACTION, Inputs, count_values
+from bms_estimator.telemetry.alarms.inputs import Inputs, count_values
 from bms_estimator.telemetry.alarms.measured_values import (
     UNUSABLE,
     SampleBuffer,
@@ -55,8 +56,6 @@ MIN_WATCHED_S = 10.0
 """Minimum duration of the samples after which alarms count as watched [s]. The delays of most critical alarms are not longer."""
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
 """Text of a wrong clock that is right again at the end of a recorded block."""
-BROKEN_WIRE_V = 0.1
-"""Voltage per cell below which a wire is broken [V]."""
 TEMPERATURE_ALARMS: frozenset[AlarmName] = frozenset(
     {"over_temperature", "under_temperature", "charging_below_freezing"}
 )

@@ -7,19 +7,13 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.kernels.alarms import MAX_SPACING_FRACTION, MIN_RESTORED_S
 from bms_estimator.model.arrays import Floats
 from bms_estimator.settings.alarm_kinds import Quantity
 
 Counts = NDArray[np.int64]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 """All measured quantities."""
-MAX_SPACING_FRACTION = 0.5
-"""Maximum interval between two values that ends a loss although samples between them lack the quantity, as a fraction of
-``lost_s``. Below 1, so that a sensor that is almost lost again stays lost."""
-
-MIN_RESTORED_S = 10.0
-"""Minimum time of samples with values that ends a loss [s], also if ``lost_s`` is shorter: a loose wire must not make a relay
-chatter."""
 
 
 @dataclass

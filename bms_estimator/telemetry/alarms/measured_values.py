@@ -16,7 +16,7 @@ from bms_estimator.settings.alarms import AlarmName
 INITIAL_ROWS = 256
 """Initial capacity of a buffer [rows]."""
 _NO_CELLS = np.array([math.nan, math.nan, 0.0, math.nan])
-"""Result of ``_summarize`` for a sample without cell voltages."""
+"""Result of ``summarize`` for a sample without cell voltages."""
 UNUSABLE = -1
 """Number of cell voltages of a sample whose cell voltages cannot be used."""
 
@@ -50,7 +50,7 @@ class SampleBuffer:
         self._samples.add(block, block.size)
         self._traces.add(trace, trace.size)
         self._forecasts.add(forecasts, trace.size)
-        summary = _summarize(cells if len(cells) == block.size else np.empty((block.size, 0)))
+        summary = summarize(cells, block.size)
         if not cells_usable:
             summary[summary[:, 2] == 0, 2] = UNUSABLE
         self._cells.add(summary, block.size)
@@ -92,13 +92,13 @@ class _Rows:
         return rows
 
 
-def _summarize(cells: CellBlock) -> Floats:
-    """Return minimum [V], maximum [V], number and mean [V] of the cell voltages of each sample, shape (n, 4).
+def summarize(cells: CellBlock, count: int) -> Floats:
+    """Return minimum [V], maximum [V], number and mean [V] of the cell voltages of ``count`` samples, shape (count, 4).
 
     The voltages of a sample without cell voltages are NaN.
     """
-    if not cells.shape[1]:
-        return np.tile(_NO_CELLS, (len(cells), 1))
+    if len(cells) != count or not cells.shape[1]:
+        return np.tile(_NO_CELLS, (count, 1))
     measured = np.count_nonzero(np.isfinite(cells), axis=1)
     with np.errstate(over="ignore", invalid="ignore"):
         mean_v = np.nansum(cells, axis=1) / np.where(measured, measured, np.nan)

@@ -6,11 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bms_estimator.kernels.alarms import FRACTION_S, RECENT_STEPS
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.arrays import Floats
-
-RECENT_STEPS = 4.0
-"""Maximum time between two intervals above ``gap_s`` that count as regular, in multiples of the longer interval."""
 
 
 @dataclass
@@ -62,8 +60,8 @@ class SampleIntervals:
         return is_regular
 
 
-INTERVAL_S = 1.0
-"""Minimum interval over which the fraction is computed [s]."""
+UNUSABLE_KINDS = "not_finite", "range", "saturated"
+"""Kinds of dropped samples that indicate a sensor fault."""
 
 
 class SampleCounts(NamedTuple):
@@ -84,7 +82,7 @@ class FaultyFraction:
         self._counted_s = -math.inf
 
     def update(self, at_s: float, counts: SampleCounts) -> tuple[Floats, float] | None:
-        """Return the time since the last call [s], shape (1,), and the fraction; None before ``INTERVAL_S`` has passed.
+        """Return the time since the last call [s], shape (1,), and the fraction; None before ``FRACTION_S`` has passed.
 
         The fraction is NaN without a sample.
 
@@ -92,7 +90,7 @@ class FaultyFraction:
             at_s: Time of the last sample on the samples' clock [s].
             counts: Numbers of samples since start.
         """
-        if 0.0 <= at_s - self._counted_s < INTERVAL_S:
+        if 0.0 <= at_s - self._counted_s < FRACTION_S:
             return None
         before, self._counts, self._counted_s = self._counts, counts, at_s
         _, observed_s = self._intervals.measure(np.array([at_s]))

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bms_estimator.fleet.ingest.batch_columns import BatchError
-from bms_estimator.fleet.ingest.batch_decoder import decode_batch
 from bms_estimator.fleet.ingest.batch_samples import BatchReader
+from bms_estimator.fleet.ingest.ingest import decode_batch
 from bms_estimator.telemetry.alarms.message import Change
 from tests.benchmarks.table import Row
 from tests.firmware.test_reset_loop import MAX_RISES, RESETS, reset_loop

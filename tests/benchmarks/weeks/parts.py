@@ -155,6 +155,8 @@ PARTS: dict[str, Part] = {
     ),
     "empty anchors": Part(anchors={"cutoff_v": -np.inf}),
     "empty anchors count once": Part((after_init(Equations, count_each_empty),)),
+    "std of the surface SOC under load": Part(((prediction, "SURFACE_STD_SOC", 0.0),)),
+    "smaller weight of SOC zones without a fit": Part(((equations, "FITTED_RMS", 1.0 / ZERO),)),
     "Huber": Part(((equations, "HUBER", 1.0 / ZERO),)),
     "larger error at the knee near empty": Part(
         ((prediction, "KNEE_STD_SOC", 0.0), (prediction, "EMPTY_RELATIVE", 0.0))

@@ -68,6 +68,18 @@ def test_the_use_of_a_pack_comes_from_its_history(capsys: pytest.CaptureFixture[
     assert "a temperature sensor" not in result["with_change"]
 
 
+def test_a_use_can_be_given_for_a_pack_without_a_history(capsys: pytest.CaptureFixture[str], pack: Path) -> None:
+    history = StateFiles(pack.parent, *load_pack(pack)).history.path
+    history.rename(history.with_suffix(".moved"))
+    try:
+        code, _, err = run(capsys, "accuracy", "--pack", pack)
+        assert code == 2
+        assert "the history has a use from 0% to 0% only; give --between LOW HIGH" in err
+        assert result_of(capsys, "--pack", pack, "--between", 30, 80)["high"] == 0.8
+    finally:
+        history.with_suffix(".moved").rename(history)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -5,7 +5,6 @@ import math
 import os
 import re
 import signal
-import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,13 +22,11 @@ from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial.device_detection import BoardClient
 from tests.command_line import PROGRAM, run
 from tests.device_line import running_device
-from tests.mosquitto import Broker
+from tests.mosquitto import PASSWORD, Broker, closed_broker
 from tests.patience import LONG_S
 from tests.pseudo_terminal import PseudoTerminal
 from tests.simavr_board import SimavrBoard, write_readings
 
-PASSWORD = "p@ss:word"
-"""Password with the separators of a URL."""
 ESTIMATE = re.compile(r"SOC [0-9.]+% ± [0-9.]+% \(2 standard deviations\), 26\.66 V, 5\.50 A")
 ANSWERS = {
     "--name": "house",
@@ -269,12 +266,9 @@ def read_hello(path: str) -> Hello:
 
 
 @pytest.fixture
-def closed_broker(tmp_path: Path) -> Iterator[Broker]:
-    """Broker with a password, as that of Home Assistant. A simulated ESPHome node publishes there."""
-    passwords = tmp_path / "passwords"
-    subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "owner", PASSWORD], check=True, capture_output=True)
-    passwords.chmod(0o644)
-    broker = Broker(tmp_path, f"allow_anonymous false\npassword_file {passwords}").start()
+def node_broker(tmp_path: Path) -> Iterator[Broker]:
+    """Broker with a password, to which a simulated ESPHome node publishes."""
+    broker = closed_broker(tmp_path).start()
     (tmp_path / "node-password").write_text(PASSWORD)
     mqtt = MqttSettings(url=broker.url, username="owner", password_file=tmp_path / "node-password")
     node = SimulatedNode(lambda _: Reading(5.0, 52.8, 21.0), cells=16, mqtt=mqtt, speed=10.0)
@@ -306,20 +300,20 @@ def check_settings_with_login(file: Path, broker: Broker) -> None:
 
 
 def test_a_publisher_at_a_broker_with_a_password_is_found_with_its_values(
-    closed_broker, file, capsys, long_timeouts, monkeypatch
+    node_broker, file, capsys, long_timeouts, monkeypatch
 ):
     monkeypatch.setattr("bms_estimator.setup.search.LISTEN_S", 2.0)
-    place = closed_broker.url.replace("://", f"://owner:{quote(PASSWORD, safe='')}@")
+    place = node_broker.url.replace("://", f"://owner:{quote(PASSWORD, safe='')}@")
     answers = options(series=None, parallel=None, broker=None)
     code, out, err = run(capsys, "new", file, "--search", place, *answers, "--yes", "--no-estimate")
     assert (code, err) == (0, "")
-    assert re.search(rf"1  esphome-jk:jk-bms: .*{closed_broker.url}; 5\d\.\d\d V, ", out)
+    assert re.search(rf"1  esphome-jk:jk-bms: .*{node_broker.url}; 5\d\.\d\d V, ", out)
     assert PASSWORD not in out
-    check_settings_with_login(file, closed_broker)
+    check_settings_with_login(file, node_broker)
 
 
 @pytest.mark.thorough
-def test_wizard_asks_for_the_password_of_a_broker_until_it_is_right(closed_broker, file):
+def test_wizard_asks_for_the_password_of_a_broker_until_it_is_right(node_broker, file):
     dialog = [
         ("User name at", "owner"),
         ("Password", "wrong"),
@@ -331,7 +325,7 @@ def test_wizard_asks_for_the_password_of_a_broker_until_it_is_right(closed_broke
         ("MQTT broker", ""),
         ("Install the service", "n"),
     ]
-    command = ("new", str(file), "--search", closed_broker.url, "--no-estimate", *options(series=None, broker=None))
+    command = ("new", str(file), "--search", node_broker.url, "--no-estimate", *options(series=None, broker=None))
     with PseudoTerminal(*command, columns=200) as terminal:
         for question, answer in dialog:
             terminal.until(lambda question=question: re.search(f"{question}[^\n]*[:?] $", plain(terminal.output)))
@@ -339,7 +333,7 @@ def test_wizard_asks_for_the_password_of_a_broker_until_it_is_right(closed_broke
             assert PASSWORD not in shown
             terminal.press(f"{answer}\r".encode())
         terminal.until(terminal.ended)
-    check_settings_with_login(file, closed_broker)
+    check_settings_with_login(file, node_broker)
 
 
 @pytest.mark.usefixtures("firmware")

@@ -6,18 +6,25 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.fleet.fits.messages import (
     FitRequest,
+    FitResult,
     Rows,
     RowsPosition,
     decode_result,
+    encode_result,
     encode_rows,
     from_bytes,
     is_fit,
 )
-from bms_estimator.fleet.fits.pack_history import FitAnswer, FitJob, run_job
+from bms_estimator.fleet.fits.pack_history import FitAnswer, FitJob, PackHistory, run_job
+from bms_estimator.fleet.worker.pack_fits import weakest_of_record, write_weakest
+from bms_estimator.fleet.worker.pack_state import PACK_STATE
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.pack.pack import Pack
+from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 from tests.estimator.simulated_cell import TRUTH, measured
+from tests.pack_model.test_bank_monitor import CURVES, FIT, discharges
 
 DIGEST, OTHER_DIGEST = (1, 2), (3, 4)
 ROWS_OF_A_MESSAGE = 10
@@ -110,3 +117,16 @@ def test_damaged_rows_are_skipped_and_named(history) -> None:
     assert answer.error
     assert elapsed_s(answer) == history["elapsed_s"][ROWS_OF_A_MESSAGE : 3 * ROWS_OF_A_MESSAGE].tolist()
     assert odd.dtype == HISTORY_ROW
+
+
+@pytest.mark.parametrize("capacity_ratio", [1.0, 0.8])
+def test_result_names_a_weak_cell_of_a_bank_by_the_discharges_since_the_previous_fit(capacity_ratio) -> None:
+    stored = PackHistory(CURVES.capacity_as)
+    stored._history = History(discharges(range(6), 1.0))
+    stored.add(from_bytes(message(discharges(range(6, 7), capacity_ratio), 2, (0, 0))))
+    result = decode_result(encode_result(FitResult(2, is_fitted=True, weakest=stored._weakest(CURVES, FIT))))
+    weakest = result.weakest
+    assert (weakest.deviation_std > WEAK_CELL_STD) == (capacity_ratio < 1.0)
+    record = np.zeros(1, PACK_STATE)[0]["fit"]
+    write_weakest(record, result)
+    assert weakest_of_record(record).capacity_ratio == weakest.capacity_ratio == pytest.approx(capacity_ratio, abs=0.05)

@@ -12,9 +12,8 @@ from nats.aio.client import Client
 from pyarrow import parquet
 
 from bms_estimator.fleet.ingest import backfill as backfill_module
-from bms_estimator.fleet.ingest.backfill import backfill
+from bms_estimator.fleet.ingest.backfill import backfill, parquet_files, read_history
 from bms_estimator.fleet.ingest.batch_samples import BatchReader
-from bms_estimator.fleet.ingest.parquet_history import parquet_files, read_history
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 from tests.fleet.ingest.platform import columns_of, options, running_ingest, samples_of

@@ -15,7 +15,7 @@ import nats
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.fleet.metrics.definitions import NODE, TENANT, WORKER
+from bms_estimator.fleet.metrics.families import NODE, TENANT, WORKER
 from bms_estimator.fleet.server.metrics_endpoint import metrics_endpoint
 from tests.fleet.serve_process import ServeProcess
 from tests.fleet.workers import PERIOD_S, SAMPLES, Process, block, load_packs, send

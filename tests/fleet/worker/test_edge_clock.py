@@ -10,7 +10,7 @@ from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.block_checks import MAX_AHEAD_S, MAX_BEHIND_S
+from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S, MAX_BEHIND_S
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.pinned_consumer import parse_position
 from bms_estimator.model.sample import SAMPLE

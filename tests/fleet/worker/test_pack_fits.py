@@ -1,5 +1,7 @@
 """Fits of packs in a worker: agreement with a replay, takeovers, and results that are late, repeated or of another request."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -48,9 +50,11 @@ class FittedStream(Stream):
         self.history: dict[str, bytes] = {}
         self.requests: list[FitRequest] = []
         self.hours: list[Hour] = []
+        self.events: list[str] = []
 
     def send(self, pack: str, data: bytes, *, defer: bool = False):
         result = super().send(pack, data, defer=defer)
+        self.events += [json.loads(each.payload)["name"] for each in result.alarms if each.topic == "event"]
         self.hours += [Hour.model_validate_json(row) for _, row in result.hours]
         for message in result.history:
             if message.subject == subjects.history(pack):
@@ -96,6 +100,7 @@ def test_worker_that_is_killed_after_each_message_agrees_with_a_replay_bit_for_b
     assert pack.slow_fit.fits >= 2
     assert stream.partition.counters["fits"] == pack.slow_fit.fits
     assert "late_fits" not in stream.partition.counters
+    assert stream.events.count("pack_fitted") == pack.slow_fit.changes > 0
     assert stream.hours[-1].r_s_ratio == pytest.approx(1.0 / FACTOR, rel=0.15)
     assert record_of(stream).tobytes() == pack.estimator.record.tobytes()
 

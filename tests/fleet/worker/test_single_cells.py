@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bms_estimator.telemetry.forecast import NAMES
-from bms_estimator.telemetry.remaining_capacity import remaining_capacity_ah
 
 from bms_estimator.edge.block import Block, decode, encode
 from bms_estimator.estimator.cell_estimator import CellEstimator
@@ -15,7 +13,7 @@ from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.worker import pack_records
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CURRENT_LAYOUT
-from bms_estimator.fleet.worker.checkpoint.record_layout import cell_count, cell_layout
+from bms_estimator.fleet.worker.pack_records import cell_count, cell_layout
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import NO_CELLS
@@ -25,8 +23,8 @@ from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.state import make_state_payload
-from bms_estimator.telemetry.weakest_cell import estimate_fields
+from bms_estimator.telemetry.state import NAMES, make_state_payload
+from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 from tests.fleet.partition_stream import STORE_ID_NS, estimates_of
 
 CELLS, CAPACITY_AH, WEAK = 4, 20.0, 2

@@ -30,6 +30,7 @@ from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker.heartbeats import assign_partitions
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.fleet.worker.retry import RETRYABLE_ERRORS
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.workers import Fitter, Heartbeats, Process, end_states
@@ -58,8 +59,7 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
         await make_streams(nc, partitions=PARTITIONS, replicas=NODES)
         fleet = SimulatedFleet(PACKS, seed=SEED, begin_ns=time.time_ns() - 86_400 * 10**9)  # the packs are fast
         await write_bucket(nc, subjects.PACKS_BUCKET, pack_rows(fleet, tmp_path / "packs.csv"))
-        bucket = PackBucket(nc)
-        await bucket.refresh()
+        bucket = await read_bucket(nc)
         workers, names = dict[str, Process](), (f"w{number}" for number in itertools.count(1))
 
         def start_worker() -> None:
@@ -122,6 +122,19 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
         sys.stdout.write(f"{fits} fits of {PACKS} packs\n")
         assert await stored_hours(nc) == expected_rows
         await nc.close()
+
+
+async def read_bucket(nc: Client) -> PackBucket:
+    """Return the table of packs, as soon as its stream has elected a leader that this node knows."""
+    bucket = PackBucket(nc)
+    async with asyncio.timeout(LONG_S):
+        while True:
+            try:
+                await bucket.refresh()
+            except RETRYABLE_ERRORS:
+                await asyncio.sleep(0.1)
+            else:
+                return bucket
 
 
 def pack_rows(fleet: SimulatedFleet, path: Path) -> dict[str, bytes]:

@@ -1,12 +1,10 @@
 """Correction of the cell file's OCV by states of the filter, one for each node of the SOC."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import ocv_correction_with_std
 from bms_estimator.kernels.kalman_filter.ocv_correction import (
@@ -20,8 +18,6 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.learning import SlowFit
-from bms_estimator.protocols.base.device import BMS_GAIN_STD
-from bms_estimator.settings.sampling import Sampling
 from tests.estimator.anywhere.cases import OXIDE, Case, cell_file, load_a
 from tests.estimator.anywhere.truth import simulate
 from tests.fit_interval import fits_every
@@ -67,19 +63,6 @@ def test_only_the_level_of_an_ocv_with_a_plateau_is_learned() -> None:
     p = estimator.settings_record[0]["filter"]
     assert (std_v > 0.9 * p["varying_error_v"]).all()
     assert std_v.min() < 0.95 * p["curve_error_v"].min()
-
-
-def test_the_level_of_a_plateau_is_learned_from_a_cell_of_another_make(shared_data: Path) -> None:
-    """The voltage of this LFP cell is 53 to 66 mV above the generic curve. The estimator starts at a true SOC of 0.64."""
-    path = shared_data / "new" / "lfp3_p35ah_id.csv.gz"
-    samples = load_capture(path).rows
-    time_s, true_soc = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 4), unpack=True)
-    samples = samples[np.interp(samples["time_s"], time_s, true_soc) < 0.64]
-    cell, sampling = load_cell("lfp", 3.5), Sampling(period_s=1.0, voltage_gain_std=BMS_GAIN_STD)
-    trace = Estimator(cell, sampling=sampling).run(samples)
-    error = trace["soc"] - np.interp(trace["time_s"], time_s, true_soc)
-    assert np.sqrt(np.mean(error**2)) < 0.09
-    assert (np.abs(error) < 2.0 * trace["soc_std"]).mean() > 0.8
 
 
 FIT_INTERVAL_S = 3.0 * 3600.0

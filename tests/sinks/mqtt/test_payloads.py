@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from bms_estimator.cli.settings.asyncapi import ARGUMENTS, document
 from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
-from bms_estimator.sinks.mqtt.asyncapi import ARGUMENTS, document
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.requests import COMMANDS, READS
 from bms_estimator.sinks.mqtt.topics import TOPICS

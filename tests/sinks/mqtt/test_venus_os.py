@@ -3,8 +3,7 @@
 import json
 from typing import Any
 
-from bms_estimator.model.payloads.alarm import Alarm
-
+from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.pack import PackSettings
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.venus_os import configured_limits

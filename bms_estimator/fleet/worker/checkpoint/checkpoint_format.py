@@ -28,8 +28,8 @@ from dataclasses import dataclass, field, replace
 from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.fleet.worker.checkpoint import format_versions
 from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError, UnreadableFormatError, is_readable
-from bms_estimator.fleet.worker.checkpoint.record_layout import CURRENT_LAYOUT, RecordWithLayout, dtype_of
 from bms_estimator.fleet.worker.deferred import Span
+from bms_estimator.fleet.worker.pack_records import CURRENT_LAYOUT, RecordWithLayout, dtype_of
 
 CHUNK_BYTES = 1 << 20
 """Size at which a chunk of entries is finished [bytes]."""

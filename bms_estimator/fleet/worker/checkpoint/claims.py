@@ -15,11 +15,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import nats.errors
+import structlog
 from nats.aio.client import Client
 from nats.js.errors import KeyNotFoundError, KeyWrongLastSequenceError
 from nats.js.kv import KeyValue
 from nats.nuid import NUID
-from pydantic import ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
@@ -27,6 +28,51 @@ from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import object_name
 from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError, is_readable
 from bms_estimator.model.errors import UserError
+
+log = structlog.get_logger(__name__)
+
+
+class ReplayRecord(BaseModel):
+    """Progress of a guarded replay of a partition."""
+
+    model_config = ConfigDict(frozen=True)
+
+    sequence: int = 0
+    """Stream sequence number of the block that the owner of the partition processes; 0: none."""
+    deaths: dict[int, int] = {}
+    """Number of owners that died while they processed a block, by its stream sequence number."""
+
+
+class ReplayRecords:
+    """Records of one tenant.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+        bucket: Key-value bucket of the records.
+    """
+
+    def __init__(self, nc: Client, bucket: KeyValue) -> None:
+        self._nc, self._bucket = nc, bucket
+
+    async def read(self, partition: int) -> ReplayRecord:
+        """Return the record of the last guarded replay of a partition."""
+        try:
+            return ReplayRecord.model_validate_json((await self._bucket.get(_key(partition))).value or b"")
+        except (KeyNotFoundError, ValidationError):
+            return ReplayRecord()
+
+    async def write(self, partition: int, record: ReplayRecord) -> None:
+        """Store the record of a guarded replay."""
+        await self._bucket.put(_key(partition), record.model_dump_json().encode())
+
+    async def send(self, partition: int, record: ReplayRecord) -> None:
+        """Send the record of a guarded replay without waiting for its storage."""
+        subject = f"$KV.{subjects.CHECKPOINTS_BUCKET}.{_key(partition)}"
+        await self._nc.publish(subject, record.model_dump_json().encode())
+
+
+def _key(partition: int) -> str:
+    return f"p{partition}.replay"
 
 
 class FencedError(Exception):
@@ -85,15 +131,25 @@ class Claims:
     async def confirm(self, claim: Claim) -> Claim:
         """Read the claim again, because the last write may have succeeded without a response.
 
+        If the server has lost its data, the result claims a partition without a checkpoint, so that the worker saves its state.
+
         Raises:
             FencedError: Another worker has taken the partition over.
         """
         stored = await self._read(claim.partition)
+        if stored is None and await self._has_lost(claim):
+            log.error("the server has lost its checkpoints: the state is saved again", partition=claim.partition)
+            return Claim(claim.partition, 0, Pointer(worker=self._worker, next=claim.pointer.next))
         if stored is None or stored.revision <= claim.revision:  # a lower revision comes from a lagging node
             return claim
         if stored.pointer == self._last_sent.get(claim.partition):
             return Claim(claim.partition, stored.revision, stored.pointer)
         raise FencedError(stored.pointer.worker)
+
+    async def _has_lost(self, claim: Claim) -> bool:
+        """Return True if the bucket is a new one, which ends before the revision of a claim."""
+        state = (await self._bucket.status()).stream_info.state
+        return bool(claim.revision > state.last_seq)
 
     async def end(self, claim: Claim) -> None:
         """Record an orderly release of a partition whose last checkpoint is up to date.

@@ -4,7 +4,7 @@ import pytest
 
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
-from bms_estimator.fleet.worker.replay_guard import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
+from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
 from tests.fleet.checkpoints import raw
 
 END_SEQUENCE = 9

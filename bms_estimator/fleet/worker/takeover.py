@@ -1,4 +1,4 @@
-"""Detection of blocks that kill workers, during the replay of a partition whose last owners have died.
+"""Takeover of a partition: restoration from its checkpoints, and detection of blocks that kill workers.
 
 A crash or an endless loop in native code gives a worker no chance to report the block. A worker that takes over a partition
 reads the stream from the last checkpoint, and therefore processes the block again. The claim counts the claims since the
@@ -7,8 +7,15 @@ the server before it processes the block. If the worker dies, the next owner the
 block that was found ``MAX_DEATHS`` times is lethal, and is skipped.
 """
 
-from bms_estimator.fleet.worker.checkpoint.claims import Claim
-from bms_estimator.fleet.worker.checkpoint.replay_records import ReplayRecord, ReplayRecords
+from contextlib import aclosing
+
+import structlog
+
+from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
+from bms_estimator.fleet.worker.checkpoint.claims import Claim, ReplayRecord, ReplayRecords
+from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError
+from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 
 GUARDED_CLAIMS = 2
 """Number of claims since the last checkpoint from which a replay is guarded. The replay after the first claim is not guarded,
@@ -76,3 +83,45 @@ class ReplayGuard:
         """Store on the server that a block was processed. The server receives this record before any later one."""
         if self.is_guarded(sequence):
             await self._records.send(self._partition, ReplayRecord(deaths=self._deaths))
+
+
+log = structlog.get_logger(__name__)
+
+
+async def restore_partition(
+    checkpoints: CheckpointStore, claim: Claim, number: int, table: PackLookup, sources: PackSources | None
+) -> Partition:
+    """Return the partition of the newest usable checkpoint; an empty one without a checkpoint.
+
+    Args:
+        checkpoints: Store of the checkpoints.
+        claim: Claim of this worker.
+        number: Number of the partition.
+        table: Settings and models of the packs.
+        sources: Rows of the same table (``Partition``).
+
+    Raises:
+        UnreadableFormatError: The newest intact checkpoint has a format that this version cannot read.
+        nats.errors.Error: The server does not respond.
+    """
+    async with aclosing(checkpoints.load(claim)) as loaded:
+        async for checkpoint, data in loaded:
+            try:
+                partition = Partition.restore(number, table, data, sources=sources)
+            except UnreadableFormatError:  # an earlier checkpoint, or none, would lose what was learned
+                raise
+            except ValueError as error:
+                log.warning(
+                    "a checkpoint cannot be used: continuing from an earlier one, or from the stream",
+                    partition=number,
+                    object=checkpoint.object,
+                    reason=str(error),
+                )
+            else:
+                log.info("taken over", partition=number, sequence=partition.sequence, bytes=len(data))
+                return partition
+    log.warning(
+        "taken over without a checkpoint, which is right only for a new server: the stream is read from its beginning",
+        partition=number,
+    )
+    return Partition(number, table, sources=sources)

@@ -1,0 +1,215 @@
+"""Alarms and events of the pack whose record is loaded, evaluated with each block.
+
+A worker has neither a line to the source nor hooks nor forecasts. Therefore it does not evaluate ``collapse_risk``, ``hook_failed``
+and ``alarm_state_lost``, and raises ``link_lost`` for a gap when the next samples arrive. No alarm latches.
+"""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.fleet.packs.pack_type import AlarmDefinitions, PackType
+from bms_estimator.fleet.worker.block_result import AlarmMessage
+from bms_estimator.kernels import alarms as kernel
+from bms_estimator.kernels.alarms import CHANGE, COUNTS, NAMES, PART, SAMPLE_ALARMS
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.events import Event, EventText, fit_event, input_fault_events, soc_events, watch_event
+from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.payloads.snapshot import Alarm
+from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock, SampleStatus
+from bms_estimator.telemetry.alarms.alarm_list import LOSS_TEXTS
+from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, find_unknown
+from bms_estimator.telemetry.alarms.evaluator import SENSOR_SUSPECTS, WRONG_CLOCK_TEXT
+from bms_estimator.telemetry.alarms.inputs import QUANTITIES
+from bms_estimator.telemetry.alarms.measured_values import has_bit, summarize
+from bms_estimator.telemetry.alarms.message import AlarmMessage as AlarmContent
+from bms_estimator.telemetry.alarms.message import alarm_payload
+from bms_estimator.telemetry.alarms.sensor_faults import PROBE_TEXT
+from bms_estimator.telemetry.alarms.state import RaisedAlarm
+from bms_estimator.telemetry.cells import cell_faults
+from bms_estimator.telemetry.health import identifier_counters, last_anchor, last_change, suspicions
+
+
+class PackAlarms:
+    """Alarms and events of the pack whose record is loaded.
+
+    Args:
+        record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
+    """
+
+    def __init__(self, record: NDArray[np.void]) -> None:
+        self._alarms, self._estimator = record["alarms"], record["estimator"]
+        self._states: NDArray[np.void] = self._alarms[0]["states"]
+        self._changes, self._scratch = np.zeros(len(NAMES), CHANGE), np.zeros((6, SAMPLE_ALARMS))
+        self._part = np.zeros(1, PART)
+        self._inputs: tuple[SampleBlock, CellBlock] = np.zeros(0, SAMPLE), NO_CELLS  # last samples of the block
+        self._has_changed = 0  # result of ``kernel.evaluate``
+        self._cell_windows = self._fits = 0  # numbers before the block
+
+    def begin_block(self, pack_type: PackType, *, is_new_time_base: bool) -> None:
+        """Begin a block of the loaded pack.
+
+        Args:
+            pack_type: Type of the pack.
+            is_new_time_base: True if the timestamps have another origin than those of the previous block.
+        """
+        if is_new_time_base:
+            kernel.begin_time_base(self._alarms)
+        if self._has_changed:
+            self._changes[...], self._has_changed = 0, 0
+        self._cell_windows = int(pack_type.cells.bank["windows"][0])
+        self._fits = pack_type.pack.slow_fit.changes if pack_type.pack.slow_fit else 0
+
+    def add(
+        self, pack_type: PackType, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock, wall_offset_s: float
+    ) -> None:
+        """Evaluate the alarms on samples and on their estimates, after the estimators have processed them.
+
+        Args:
+            pack_type: Type of the pack.
+            samples: Samples, shape (n,), dtype SAMPLE.
+            cells_v: Their cell voltages [V]; empty without any.
+            trace: Their estimates.
+            wall_offset_s: Wall clock of the edge minus the samples' clock [s].
+        """
+        if self._scratch.shape[1] < samples.size:
+            self._scratch = np.zeros((6, samples.size))
+        slow_fit = pack_type.pack.slow_fit
+        self._part[0] = wall_offset_s, *self._cell_values(pack_type), slow_fit.weak_cell_std if slow_fit else math.nan
+        self._inputs = samples, cells_v
+        limits, settings = pack_type.alarms.limits, pack_type.alarms.settings
+        self._has_changed |= kernel.evaluate(
+            self._alarms,
+            limits,
+            settings,
+            self._part,
+            self._estimator,
+            samples,
+            cells_v,
+            trace,
+            self._scratch,
+            self._changes,
+        )
+
+    def _cell_values(self, pack_type: PackType) -> tuple[float, float, float]:
+        """Return time [s], self-discharge [A] and error of the readings [V] of a new estimate of the cells; NaN without one."""
+        cells, windows = pack_type.cells.deviations, int(pack_type.cells.bank["windows"][0])
+        if cells is None or windows == self._cell_windows:
+            return math.nan, math.nan, math.nan
+        self._cell_windows = windows
+        return cells.at_s, max(float(cells.proven_self_discharge_a.max()), 0.0), float(cells.reading_error_v.max())
+
+    @property
+    def is_soc_known(self) -> bool:
+        """True if the SOC of the loaded pack was known at its last estimate."""
+        return bool(self._alarms[0]["soc_known"])
+
+    @property
+    def raised(self) -> tuple[str, ...]:
+        """Names of the raised alarms of the loaded pack."""
+        return tuple(NAMES[k] for k in np.flatnonzero(self._states["raised"]))
+
+    def messages(
+        self, pack_type: PackType, trace: TraceBlock, now_s: float, *, is_whole: bool
+    ) -> tuple[AlarmMessage, ...]:
+        """Return the messages about the changes of the block, and its events.
+
+        Args:
+            pack_type: Type of the pack.
+            trace: Last estimates of the block; empty without any.
+            now_s: Wall clock [s since 1970].
+            is_whole: True: also about alarms that have been raised or unwatched since an earlier block.
+        """
+        slow_fit = pack_type.pack.slow_fit
+        if not (self._has_changed or is_whole or (slow_fit and slow_fit.changes > self._fits)):
+            return ()
+        changes = self._changes
+        is_due = (changes["was_raised"] | changes["has_ended"] | changes["has_watch_changed"]) != 0
+        if is_whole:
+            is_due |= (self._states["raised"] | self._states["unwatched"]) != 0
+        positions = set(np.flatnonzero(is_due).tolist()) & pack_type.alarms.by_position.keys()
+        about_alarms = (each for k in sorted(positions) for each in self._messages_of(k, pack_type, trace, now_s))
+        return (*about_alarms, *(_event(text, now_s) for text in self._events(pack_type)))
+
+    def _messages_of(self, k: int, pack_type: PackType, trace: TraceBlock, now_s: float) -> Iterator[AlarmMessage]:
+        """Yield the messages about alarm ``k``: its raising in this block, and its present state, unless they are equal."""
+        state, change, definition = self._states[k], self._changes[k], pack_type.alarms.by_position[k]
+        lost = kernel.lost_quantities(self._alarms[0])
+        missing = [
+            LOSS_TEXTS[name] for q, name in enumerate(QUANTITIES) if lost >> q & 1 and name in definition.kind.needs
+        ]
+        reasons = tuple(self._reasons(k, pack_type, lost))
+        unknown = find_unknown(trace[-1], soc_known=self.is_soc_known) if trace.size else {}
+
+        def payload(record: np.void, *, is_raised: bool) -> Alarm:
+            value = float(record["value"])
+            raised = RaisedAlarm(float(record["since_s"]), None if np.isnan(value) else value) if is_raised else None
+            return alarm_payload(
+                definition,
+                AlarmContent(
+                    raised,
+                    cause_cleared=False,
+                    reasons=reasons,
+                    unwatched_reason=("; ".join(missing) or "its delay runs") if state["unwatched"] else None,
+                    unknown_reason=unknown.get(definition.name),
+                ),
+            )
+
+        is_raised = bool(state["raised"])
+        if change["was_raised"]:
+            alarm = payload(change, is_raised=True)
+            yield _event(EventText("alarm_raised", f"{alarm.name}: {alarm.text}"), now_s)
+            if not is_raised:
+                yield _message(alarm)
+        if change["has_ended"]:
+            yield _event(EventText("alarm_cleared", definition.name), now_s)
+        present = payload(state, is_raised=is_raised)
+        if change["has_watch_changed"]:
+            yield _event(watch_event(present), now_s)
+        yield _message(present)
+
+    def _events(self, pack_type: PackType) -> Iterator[EventText]:
+        """Yield the events beside those of the alarms since the last call."""
+        slow_fit, record = pack_type.pack.slow_fit, self._estimator[0]
+        if slow_fit and slow_fit.changes > self._fits and (change := last_change(slow_fit)):
+            yield fit_event(change)
+        reported = dict(zip(COUNTS.names or (), self._alarms[0]["reported"].item(), strict=True))
+        former_faults = [fault.text for fault in InputFault(reported["suspects"])]
+        yield from input_fault_events(former_faults, suspicions(record, pack_type.estimator.settings_record[0]))
+        yield from soc_events(reported, identifier_counters(record), last_anchor(record))
+        kernel.mark_reported(self._alarms, self._estimator)
+
+    def _reasons(self, k: int, pack_type: PackType, lost: int) -> Iterator[str]:
+        """Yield the causes of alarm ``k`` beyond its value, one sentence each."""
+        name, cells = NAMES[k], pack_type.cells.deviations
+        if name == "sensor_fault":
+            yield from (LOSS_TEXTS[quantity] for q, quantity in enumerate(QUANTITIES) if lost >> q & 1)
+            yield from self._input_faults(pack_type.alarms)
+        if cells is not None and name in ("cell_short", "cell_sensor_fault"):
+            faults = cell_faults(cells)
+            yield from (faults.short if name == "cell_short" else faults.reading).texts
+        own = {"sensor_fault": SENSOR_SUSPECTS, "model_mismatch": MODEL_SUSPECTS}.get(name, InputFault(0)) & InputFault(
+            int(self._estimator["checks"]["suspects"][0])
+        )
+        if own:
+            texts = suspicions(self._estimator[0], pack_type.estimator.settings_record[0])
+            yield from (text for text in texts for suspect in own if text.endswith(suspect.text))
+
+    def _input_faults(self, definitions: AlarmDefinitions) -> Iterator[str]:
+        """Yield the faults of the last samples, one sentence each."""
+        samples, cells_v = self._inputs
+        for bit, text in ((SampleStatus.WRONG_CLOCK, WRONG_CLOCK_TEXT), (SampleStatus.PROBE_FAULT, PROBE_TEXT)):
+            if has_bit(samples, bit).any():
+                yield text
+        yield from (each.text for each in definitions.bounds.find(samples, summarize(cells_v, samples.size)).values())
+
+
+def _message(alarm: Alarm) -> AlarmMessage:
+    return AlarmMessage(f"alarm.{alarm.name}", alarm.model_dump_json().encode())
+
+
+def _event(text: EventText, now_s: float) -> AlarmMessage:
+    return AlarmMessage("event", Event(time=iso_utc(now_s), **text._asdict()).model_dump_json().encode())
