@@ -25,9 +25,9 @@ from bms_estimator.process.memory import anonymous_bytes, available_bytes
 from bms_estimator.process.systemd import extend_start
 
 ORDER_FILE = Path(__file__).with_name("compile_order.txt")
-"""File with the kernels in the order in which a first start compiled them: CPU time [s], name and types of the arguments.
+"""File with the kernels of a first start, callees before callers: CPU time [s], name and types of the arguments.
 ``make compile-order`` writes it."""
-MAX_CHILD_BYTES = 160 * 2**20
+MAX_CHILD_BYTES = 144 * 2**20
 """Anonymous memory above which a child ends [bytes]. One kernel adds at most 25 MiB."""
 CHILD_BYTES = 256 * 2**20
 """Available memory for which one child is started [bytes]."""

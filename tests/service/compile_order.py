@@ -1,9 +1,15 @@
-"""Record the kernels of a first start in the order of their compilation: ``make compile-order``."""
+"""Record the kernels of a first start: ``make compile-order``.
 
+The kernels that call no other come first, then those that call only these, and so on. Thus two children seldom wait for each other.
+"""
+
+import dis
+import functools
 import time
 
 from numba import types
 from numba.core import event
+from numba.core.dispatcher import Dispatcher
 
 from bms_estimator.service import kernel_warm_up
 from bms_estimator.service.kernel_compilation import ORDER_FILE, argument_types
@@ -29,7 +35,16 @@ class Recorder(event.Listener):
         if package == "bms_estimator":
             texts = ", ".join(text(each, self._names) for each in arguments)
             call = f"{module}.{function.__qualname__} ({texts}{',' if texts else ''})"
-            self.lines.append(f"{duration - of_callees:.2f} {call}")
+            self.lines.append((levels_below(ended.data["dispatcher"]), f"{duration - of_callees:.2f} {call}"))
+
+
+@functools.cache
+def levels_below(kernel):
+    """Return the number of levels of kernels that a kernel calls."""
+    function = kernel.py_func
+    names = {each.argval for each in dis.get_instructions(function) if each.opname == "LOAD_GLOBAL"}
+    callees = [function.__globals__.get(name) for name in names]
+    return max((1 + levels_below(each) for each in callees if isinstance(each, Dispatcher)), default=0)
 
 
 def text(argument, names):
@@ -50,7 +65,7 @@ def main():
     recorder = Recorder()
     with event.install_listener("numba:compile", recorder):
         kernel_warm_up._call_kernels()
-    ORDER_FILE.write_text("".join(f"{each}\n" for each in recorder.lines))
+    ORDER_FILE.write_text("".join(f"{line}\n" for _, line in sorted(recorder.lines, key=lambda each: each[0])))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ SOURCE = Path(__file__).with_name("uas_step.c")
 COMPILER = [
     "cc",
     "-O3",
-    "-march=native",
     "-ffp-contract=off",
     "-std=gnu11",
     "-Wall",
