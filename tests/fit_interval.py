@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from bms_estimator.pack_model import learning
+from bms_estimator.pack_model import slow_fit as slow_fit_module
 
 
 @contextlib.contextmanager
@@ -15,5 +15,5 @@ def fits_every(interval_s: float) -> Iterator[None]:
     Each fit uses the whole history, so that fewer fits have nearly the same final result.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning, "MIN_INTERVAL_S", interval_s)
+        patch.setattr(slow_fit_module, "MIN_INTERVAL_S", interval_s)
         yield

@@ -304,7 +304,7 @@ def make_estimator(settings: Settings, cell: PackModel) -> Estimator:
     )
 
 
-def new_estimator(settings: Settings, cell: PackModel) -> Estimator:
+def compiled_estimator(settings: Settings, cell: PackModel) -> Estimator:
     """Create the estimator of a pack after compiling or loading all kernels, so that no sample waits for a compilation."""
     make_estimator(settings, cell).run(np.zeros(1, dtype=SAMPLE))
     return make_estimator(settings, cell)

@@ -10,7 +10,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
-from bms_estimator.estimator.estimator import TraceBlock, new_estimator
+from bms_estimator.estimator.estimator import TraceBlock, compiled_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.forecast.available_power import power_limits
@@ -37,8 +37,8 @@ from bms_estimator.pack.state import (
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import use_fitted_curves
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.learning import FIT_INTERVAL_S, SlowFit, Submit, run_now
 from bms_estimator.pack_model.saved import fit_of_curves, history_of
+from bms_estimator.pack_model.slow_fit import FIT_INTERVAL_S, SlowFit, Submit, run_now
 from bms_estimator.settings.pack import Settings
 
 PRIOR_S = 600.0
@@ -295,7 +295,7 @@ def new_pack(
     def slow_fit(estimator: Estimator, interval_s: float) -> SlowFit:
         return SlowFit(estimator, submit=submit, interval_s=interval_s, on_failure=on_failure)
 
-    return assemble(new_estimator(settings, model), settings, slow_fit, has_forecasts=has_forecasts)
+    return assemble(compiled_estimator(settings, model), settings, slow_fit, has_forecasts=has_forecasts)
 
 
 def assemble(

@@ -6,7 +6,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
@@ -16,8 +16,8 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import fit
-from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.saved import neutral_fit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.kernel_compilation import compile_kernels
 from bms_estimator.settings.alarm_limits import MIN_CELLS
@@ -51,7 +51,7 @@ def load_kernels() -> None:
 def _call_kernels() -> None:
     """Call all kernels of a live run once."""
     cell = load_cell(CELL)
-    estimator = new_estimator(Settings(), cell)
+    estimator = compiled_estimator(Settings(), cell)
     sample = np.zeros(1, dtype=SAMPLE)
     sample["voltage_v"] = cell.cell.nominal_voltage_v
     trace = estimator.run(sample)
@@ -59,7 +59,7 @@ def _call_kernels() -> None:
     Window().add(trace, 0.0)
     known_rows(trace, False)
     pack = cell.pack(MIN_CELLS, 1)
-    CellEstimator(new_estimator(Settings(), pack)).run(sample, np.zeros((1, MIN_CELLS)), trace)
+    CellEstimator(compiled_estimator(Settings(), pack)).run(sample, np.zeros((1, MIN_CELLS)), trace)
     estimator.add_prior(0.5, 0.1)
     estimator.set_soc(0.5)
     estimator.resume(0.0)

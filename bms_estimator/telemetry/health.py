@@ -28,7 +28,7 @@ from bms_estimator.model.payloads.health import (
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.history import DAY_S
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 
 
 class FitTimes(NamedTuple):

@@ -24,7 +24,7 @@ from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit, fit
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.simulation.simulated_bank import BankCells, BankHistory, SimulatedBank
 from tests.pack_model.bank_cycles import cycle
 

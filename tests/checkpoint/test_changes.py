@@ -9,7 +9,7 @@ import pytest
 
 from bms_estimator.checkpoint.changes_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_BASE_AGE_S, MAX_SOC_CHANGE
 from bms_estimator.checkpoint.state_files import CheckpointFile
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.model.arrays import fields
 from bms_estimator.process.boot_clock import BootTimestamp
@@ -72,7 +72,7 @@ def test_small_changes_are_saved_in_one_block_and_restored_with_their_time(pack:
     assert np.array_equal(content.record["filter.mean"][0, :count], state["filter"]["mean"][0, :count])
     assert np.array_equal(content.record["history.charge_as"], state["history"]["charge_as"])
     assert np.array_equal(content.record["filter.covariance"], first_covariance)
-    assert restore_state(new_estimator(SETTINGS, CELL), content.record, content.gap_s) == ""
+    assert restore_state(compiled_estimator(SETTINGS, CELL), content.record, content.gap_s) == ""
 
 
 def test_a_block_damaged_by_a_power_failure_leaves_the_state_of_the_save_before(pack: SavedPack) -> None:

@@ -19,7 +19,7 @@ from numpy.lib.recfunctions import repack_fields
 from bms_estimator.checkpoint.arrays_file import pack_identity
 from bms_estimator.checkpoint.state_files import FORMAT, MAX_FILES, CheckpointFile, StateFiles
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.kernels.kalman_filter.records import OFFSET
@@ -45,7 +45,7 @@ def edit_settings(section: str, **values: Any) -> Settings:
 
 def learned_estimator() -> Estimator:
     """Return an estimator after ten minutes of load, with a map of elements."""
-    estimator = new_estimator(SETTINGS, CELL)
+    estimator = compiled_estimator(SETTINGS, CELL)
     for i in range(600):
         estimator.step(float(i), 0.3 * (i // 60 % 2), 3.8)
     estimator.record["map"]["weight"] = estimator.record["map"]["moment"] = 1.0
@@ -138,7 +138,7 @@ async def test_parameters_of_the_learning_law_are_restored_only_under_the_same_s
     tmp_path: Path,
 ) -> None:
     settings = edit_settings("observer", law="learning")
-    learned = new_estimator(settings, CELL)
+    learned = compiled_estimator(settings, CELL)
     for i in range(3600):
         learned.step(float(i), 0.3 * (i // 60 % 2), 3.8 - 0.03 * (i // 60 % 2))
     theta = learned.record[0]["learning"]["theta"].copy()
@@ -184,7 +184,11 @@ def test_the_identity_of_a_pack_depends_on_number_of_cells_capacity_ocv_and_sign
 
 def test_known_fields_of_a_checkpoint_of_another_version_are_restored() -> None:
     """The other version lacks two fields, has another shape of one, and has one that this version does not know."""
-    saved, fresh, estimator = learned_estimator(), new_estimator(SETTINGS, CELL), new_estimator(SETTINGS, CELL)
+    saved, fresh, estimator = (
+        learned_estimator(),
+        compiled_estimator(SETTINGS, CELL),
+        compiled_estimator(SETTINGS, CELL),
+    )
     fresh.step(0.0, 0.0, CELL.cell.nominal_voltage_v)
     of_other_version = dict(fields(saved.record))
     del of_other_version["checks.good_soc"], of_other_version["map.dwell_s"]
@@ -205,7 +209,7 @@ def test_a_checkpoint_without_anchors_is_restored_and_one_with_anchors_keeps_the
     by_name = dict(fields(saved.record))
     without_anchors = {name: v for name, v in by_name.items() if not name.startswith("anchors.")}
     for state, expected in ((without_anchors, (0, 0, 0.0, 0.0)), (by_name, (FULL, 0, 0.02, 0.9))):
-        estimator = new_estimator(SETTINGS, CELL)
+        estimator = compiled_estimator(SETTINGS, CELL)
         assert restore_state(estimator, state, 1.0) == ""
         assert estimator.state["soc"][0] == saved.state["soc"][0]
         restored = estimator.record[0]["anchors"]
@@ -226,7 +230,7 @@ async def test_an_invalid_checkpoint_is_set_aside_with_the_reason(
 ) -> None:
     file = CheckpointFile(tmp_path, SETTINGS, CELL)
     (tmp_path / "pack.refused.npz").write_bytes(b"an older one")
-    estimator = new_estimator(SETTINGS, CELL)
+    estimator = compiled_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
     reason = "refused: damaged, perhaps by a power cut"
     if damage == "nan":
@@ -266,7 +270,7 @@ async def test_each_cell_has_its_own_checkpoint(tmp_path: Path) -> None:
 
 def test_the_oldest_checkpoints_of_a_pack_name_are_removed_above_the_maximum_number(tmp_path: Path) -> None:
     """A pack has one checkpoint for each cell model. Those of another pack are not removed."""
-    estimator = new_estimator(SETTINGS, CELL)
+    estimator = compiled_estimator(SETTINGS, CELL)
     (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
     for series in range(1, MAX_FILES + 4):
         file = CheckpointFile(tmp_path, SETTINGS, CELL.pack(series, 1))
@@ -282,7 +286,7 @@ def test_a_checkpoint_is_private_and_a_symlink_at_its_temporary_name_is_not_foll
     file, victim = CheckpointFile(tmp_path, SETTINGS, CELL), tmp_path / "victim"
     victim.write_text("precious")
     file.path.with_suffix(".new").symlink_to(victim)
-    file.save(new_estimator(SETTINGS, CELL).record)
+    file.save(compiled_estimator(SETTINGS, CELL).record)
     assert victim.read_text() == "precious"
     assert stat.S_IMODE(file.path.lstat().st_mode) == 0o600
 
@@ -294,9 +298,9 @@ def offset_covariance(estimator: Estimator) -> np.ndarray:
 
 
 def test_an_offset_that_was_disabled_starts_with_the_configured_std_and_vice_versa() -> None:
-    before = new_estimator(edit_settings("identifier", current_offset_std_a=0.0), CELL)
+    before = compiled_estimator(edit_settings("identifier", current_offset_std_a=0.0), CELL)
     before.step(0.0, 0.1, 3.8)
-    after = new_estimator(edit_settings("identifier", current_offset_std_a=0.1), CELL)
+    after = compiled_estimator(edit_settings("identifier", current_offset_std_a=0.1), CELL)
     assert restore_state(after, dict(fields(before.record)), 1.0) == ""
     assert offset_covariance(after)[OFFSET] == pytest.approx(0.01)
     after.step(0.0, 0.1, 3.8)
@@ -305,9 +309,9 @@ def test_an_offset_that_was_disabled_starts_with_the_configured_std_and_vice_ver
 
 
 def test_an_identifier_that_was_disabled_starts_at_the_counted_soc() -> None:
-    counted = new_estimator(edit_settings("identifier", enabled=False), CELL)
+    counted = compiled_estimator(edit_settings("identifier", enabled=False), CELL)
     counted.step(0.0, 0.1, 3.8)
-    identifying = new_estimator(SETTINGS, CELL)
+    identifying = compiled_estimator(SETTINGS, CELL)
     assert restore_state(identifying, dict(fields(counted.record)), 1.0) == ""
     for i in range(3):
         identifying.step(float(i), 0.0, 3.8)

@@ -11,7 +11,7 @@ from bms_estimator.estimator.identified_parameters import relative_capacity, rel
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.pack.pack import Pack, new_pack
-from bms_estimator.pack_model import learning
+from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.settings.pack import Settings
@@ -62,8 +62,8 @@ def learned(pack: Pack, capacity_ah: float) -> tuple[float, float]:
 def test_a_corrected_capacity_keeps_soc_curves_and_what_was_learned(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong_ah: float
 ) -> None:
-    monkeypatch.setattr(learning, "fit", quick_fit)
-    monkeypatch.setattr(learning, "MIN_THROUGHPUT_SOC", 0.0)
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
+    monkeypatch.setattr(slow_fit_module, "MIN_THROUGHPUT_SOC", 0.0)
     before, after = new_pack(SETTINGS, model(wrong_ah)), new_pack(SETTINGS, model(CAPACITY_AH))
     run(before, 3.0)
     assert before.slow_fit

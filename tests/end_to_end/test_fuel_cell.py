@@ -11,7 +11,7 @@ import pytest
 from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
@@ -75,7 +75,7 @@ folder = "{tmp_path / "state"}"
     settings, cell = load_pack(pack)
     saved = CheckpointFile(tmp_path / "state", settings, cell).load()
     assert not saved.reasons
-    replayed, resumed = new_estimator(settings, cell), new_estimator(settings, cell)
+    replayed, resumed = compiled_estimator(settings, cell), compiled_estimator(settings, cell)
     for block in RawCapture(capture):
         replayed.run(block)
     assert saved.record["learning.theta"].tobytes() == replayed.record["learning"]["theta"].tobytes(), "to the last bit"
@@ -83,5 +83,6 @@ folder = "{tmp_path / "state"}"
     np.testing.assert_array_equal(resumed.record["learning"]["theta"], replayed.record["learning"]["theta"])
     not_finite = {**saved.record, "learning.theta": np.full_like(saved.record["learning.theta"], np.nan)}
     assert (
-        restore_state(new_estimator(settings, cell), not_finite, unseen_s=10.0) == "theta of the learning is not finite"
+        restore_state(compiled_estimator(settings, cell), not_finite, unseen_s=10.0)
+        == "theta of the learning is not finite"
     )

@@ -13,11 +13,11 @@ import pytest
 
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.protocols.firmware.messages import ResetCause
 from bms_estimator.simulation.simulated_pack import SimulatedPack, pulses
 from bms_estimator.simulation.virtual_adc import Reading
@@ -180,7 +180,7 @@ async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
         running.cancel()
     settings, cell = load_pack(pack)
     live = CheckpointFile(tmp_path / "state", settings, cell).load().record
-    replayed = new_estimator(settings, cell)
+    replayed = compiled_estimator(settings, cell)
     pack_replay, capture_file = Pack(replayed, SlowFit(replayed)), RawCapture(capture)
     for block in capture_file:
         pack_replay.run(block)

@@ -14,7 +14,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import IdentifiedValue, current_offset, relative_capacity
 from bms_estimator.kernels.kalman_filter.records import LN_Q
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.anywhere.cases import Capture, Case, capture
 from tests.estimator.anywhere.use import DAY_S, cycles, days
 from tests.fit_interval import fits_every

@@ -9,7 +9,7 @@ from bms_estimator.forecast.forecast import FORECAST
 from bms_estimator.forecast.forecaster import MAX_INTERVAL_S, Forecaster
 from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.simulated_cell import TRUTH
 from tests.forecast.simulated_load import CUTOFF_V, changing_load, constant_load, cutoff_s, forecasting_pack
 

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import MAX_TRIP_S, constant_trip, profile_trip
 from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
@@ -26,7 +26,7 @@ def array(*values: float) -> np.ndarray:
 @pytest.fixture(scope="module")
 def forecaster() -> Forecaster:
     """Return the forecaster of a cell at rest at SOC 0.5."""
-    estimator = new_estimator(Settings(pack=PackSettings(initial_soc=0.5)), CELL)
+    estimator = compiled_estimator(Settings(pack=PackSettings(initial_soc=0.5)), CELL)
     forecaster = Forecaster(estimator, cutoff_v=CUTOFF_V)
     samples = np.zeros(60, SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(60), 3.62, 25.0

@@ -22,10 +22,11 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.pack_model import fit as fit_module
-from bms_estimator.pack_model import learning, solve
+from bms_estimator.pack_model import slow_fit as slow_fit_module
+from bms_estimator.pack_model import solve
 from bms_estimator.pack_model.history import ReferenceDischarges, WeakCellTime
-from bms_estimator.pack_model.learning import Submit, run_now
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays, neutral_fit
+from bms_estimator.pack_model.slow_fit import Submit, run_now
 from bms_estimator.settings.pack import Settings
 
 SERIES = 4
@@ -117,8 +118,8 @@ def quick_fits():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit_module, "STARTS", fit_module.STARTS[:1])
         patch.setattr(solve, "MAX_ITERATIONS", 0)
-        patch.setattr(learning, "MIN_THROUGHPUT_SOC", 0.0)
-        patch.setattr(learning, "MIN_INTERVAL_S", FIT_S)
+        patch.setattr(slow_fit_module, "MIN_THROUGHPUT_SOC", 0.0)
+        patch.setattr(slow_fit_module, "MIN_INTERVAL_S", FIT_S)
         yield
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from bms_estimator.checkpoint.run_file import add_checksum
 from bms_estimator.checkpoint.state_files import StateFiles
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
@@ -23,7 +23,7 @@ from tests.scripted_source import ScriptedSource
 
 SETTINGS = Settings.model_validate({"pack": {"cell": "ncr18650"}})
 CELL = load_cell("ncr18650")
-ESTIMATOR = new_estimator(SETTINGS, CELL)
+ESTIMATOR = compiled_estimator(SETTINGS, CELL)
 RAISED = {"since_s": 1.7e9, "value": 4.4, "gone": True, "acknowledged": False, "severity": "critical"}
 ALARMS = {
     "pack_over_voltage": RAISED,

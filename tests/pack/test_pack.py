@@ -8,7 +8,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack.state import PackState
-from bms_estimator.pack_model import learning
+from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_pack import SimulatedPack as SimulatedLoad
@@ -46,8 +46,8 @@ def run_in_blocks(recording: tuple[np.ndarray, np.ndarray], size: int) -> tuple[
 def test_estimates_forecasts_and_cells_do_not_depend_on_the_division_into_blocks(
     recording: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learning, "fit", quick_fit)
-    monkeypatch.setattr(learning, "MIN_THROUGHPUT_SOC", 0.0)
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
+    monkeypatch.setattr(slow_fit_module, "MIN_THROUGHPUT_SOC", 0.0)
     whole, trace, forecasts = run_in_blocks(recording, recording[0].size)
     assert whole.slow_fit
     assert whole.slow_fit.fits >= 2  # in the middle of the only block
@@ -98,7 +98,7 @@ def test_a_pack_without_forecasts_still_observes_the_load(recording: tuple[np.nd
 def test_the_wait_for_the_first_sample_extends_the_gap_of_record_history_and_cells(
     recording: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learning, "fit", quick_fit)
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
     before, model = new_pack(Settings(), SimulatedPack().model), SimulatedPack().model
     before.run(*recording)
     assert before.slow_fit

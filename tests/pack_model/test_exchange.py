@@ -10,10 +10,10 @@ from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAUS, WEAK_J
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model import learning
+from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.cell_curves import arrhenius
 from bms_estimator.pack_model.fit import SOC, PackFit, fit
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.simulated_cell import TRUTH, measured
 from tests.pack_model.histories import Truth, cell_curves, measured_rows, with_voltages
 from tests.pack_model.quick_fit import quick_fit
@@ -91,7 +91,7 @@ def test_temperature_that_was_never_measured_is_no_exchange() -> None:
 
 
 def test_exchange_raises_the_diagnostic(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "fit", lambda *args: replace(quick_fit(*args), is_exchanged=True))
+    monkeypatch.setattr(slow_fit_module, "fit", lambda *args: replace(quick_fit(*args), is_exchanged=True))
     current_a = np.tile(np.repeat([0.8, -0.8], 1800), 3) * TRUTH.cell.capacity_ah
     block = measured(current_a, 0.7, np.random.default_rng(1))[0]
     slow_fit = SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah), initial_soc=0.7), interval_s=5000.0)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.resume import resume_history
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.pack import Settings
 
 CELL = load_cell("ncr18650")
@@ -19,7 +19,7 @@ CAPACITY_AS = CELL.cell.capacity_ah * 3600.0
 
 def discharged(seconds: int, saved_s: int) -> tuple[Estimator, History]:
     """Return an estimator after a discharge at C/2, and its history as it was saved at ``saved_s``."""
-    estimator = new_estimator(Settings(), CELL)
+    estimator = compiled_estimator(Settings(), CELL)
     model, saved = SlowFit(estimator), History()
     for second in range(seconds):
         estimator.step(float(second), 0.5 * CELL.cell.capacity_ah, 3.9 + 1e-3 * (second % 3))

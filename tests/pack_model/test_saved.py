@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.estimator.estimator import Estimator, new_estimator
+from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.estimator.identified_parameters import identified_cell, relative_series_resistance
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
@@ -66,7 +66,7 @@ def test_a_missing_field_of_the_curves_is_rejected() -> None:
 
 def fitted_estimator(cell: CellModel = CELL) -> Estimator:
     """Return an estimator at rest with the curves of a fit."""
-    estimator = new_estimator(Settings(), cell.pack(SERIES, 1))
+    estimator = compiled_estimator(Settings(), cell.pack(SERIES, 1))
     file_settings = estimator.cell_file_settings
     adopt_curves(estimator.settings_record[0]["filter"], file_settings, quick_fit(None, some_rows()))  # type: ignore[arg-type]
     for second in range(30):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.checkpoint.state_files import CheckpointFile
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp, synchronised
 from bms_estimator.settings.pack import Settings
@@ -33,7 +33,7 @@ SAVED = BootTimestamp(wall_s=1_700_000_000.0, synchronised=True, boot_s=5000.0, 
 def test_the_age_of_a_checkpoint_is_read_from_a_clock_that_can_be_trusted_and_is_infinite_without_one(
     tmp_path: Path, changes: dict[str, float | str | bool], unseen_s: float
 ) -> None:
-    estimator = new_estimator(SETTINGS, CELL)
+    estimator = compiled_estimator(SETTINGS, CELL)
     estimator.step(0.0, 0.1, 3.8)
     CheckpointFile(tmp_path, SETTINGS, CELL, lambda: SAVED).save(estimator.record)
     later = replace(SAVED, **changes)

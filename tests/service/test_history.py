@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.checkpoint.run_file import RunCounters, RunFile
 from bms_estimator.checkpoint.state_files import FORMAT, MAX_LATER_FILES, CheckpointFile, StateFiles
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.service import checkpoint_writer
@@ -294,12 +294,12 @@ async def run_with_hanging_disk(hung_files: StateFiles) -> None:
 
 async def test_after_a_gap_of_a_week_the_soc_is_estimated_from_the_voltage(tmp_path: Path) -> None:
     """The pack was charged while the service was off for a week."""
-    estimator = new_estimator(SETTINGS, CELL)
+    estimator = compiled_estimator(SETTINGS, CELL)
     for second in range(600):
         estimator.step(float(second), 0.0, 3.75)
     CheckpointFile(tmp_path, SETTINGS, CELL, lambda: clock_at(0.0)).save(estimator.record)
     restored, _ = await run_at(24.0 * 7.0, tmp_path, *((float(i), 0.0, 3.95) for i in range(60)))
-    fresh = new_estimator(Settings(), CELL)  # its SOC is that of its first voltage
+    fresh = compiled_estimator(Settings(), CELL)  # its SOC is that of its first voltage
     fresh.step(0.0, 0.0, 3.95)
     assert fresh.state["soc"][0] > estimator.state["soc"][0] + 0.3
     assert restored.state["soc"][0] == pytest.approx(fresh.state["soc"][0], abs=0.03)
@@ -308,7 +308,7 @@ async def test_after_a_gap_of_a_week_the_soc_is_estimated_from_the_voltage(tmp_p
 
 def test_gap_lengths_are_those_that_the_kernel_counts_as_gaps() -> None:
     """Steps of the time are regular, twice the limit of a gap, long, or backward, in random order."""
-    estimator, rng = new_estimator(SETTINGS, CELL), np.random.default_rng(5)
+    estimator, rng = compiled_estimator(SETTINGS, CELL), np.random.default_rng(5)
     gap_s = float(estimator.settings["gap_s"][0])
     steps = rng.choice([0.1, 1.0, 2.0 * gap_s, 100.0, -50.0], 400)
     times = np.cumsum(steps)

@@ -15,7 +15,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
@@ -23,7 +23,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.live_loop import LAG_STEP_S, ServiceParts, run_estimation_loop
@@ -142,7 +142,7 @@ async def test_state_after_blocks_equals_that_after_single_steps() -> None:
         for i in range(0, 500, 7):
             run.source.give(*rows[i : i + 7])
         live = await run.end()
-    single_steps = new_estimator(SETTINGS, CELL)
+    single_steps = compiled_estimator(SETTINGS, CELL)
     SlowFit(single_steps)  # switches the history on
     for row in rows:
         single_steps.step(*row)

@@ -14,7 +14,7 @@ import pytest
 from bms_estimator.checkpoint.arrays_file import FORMAT, ArraysFile
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
@@ -25,8 +25,8 @@ from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model import fit as fit_module
-from bms_estimator.pack_model import learning
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model import slow_fit as slow_fit_module
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
@@ -63,8 +63,8 @@ def day() -> SampleBlock:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the fit by ``quick_fit``, from the first hour on."""
-    monkeypatch.setattr(learning, "fit", quick_fit)
-    monkeypatch.setattr(learning, "MIN_THROUGHPUT_SOC", 0.0)
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
+    monkeypatch.setattr(slow_fit_module, "MIN_THROUGHPUT_SOC", 0.0)
 
 
 class OneThread(ThreadPoolExecutor):
@@ -211,7 +211,7 @@ async def test_a_failing_fit_is_counted_and_leaves_the_previous_one(
             raise ValueError("no minimum")
         return quick_fit(*arguments)
 
-    monkeypatch.setattr(learning, "fit", failing)
+    monkeypatch.setattr(slow_fit_module, "fit", failing)
     result = await run_service(day[: 6 * HOUR])
     assert result.estimator.state["samples"][0] == 6 * HOUR
     assert result.model.fits == 1
@@ -314,7 +314,7 @@ async def test_a_history_whose_use_raises_exceptions_is_set_aside_and_the_servic
     def fail(*_: Any) -> None:
         raise ArithmeticError("odd value")
 
-    monkeypatch.setattr(f"bms_estimator.pack_model.learning.{failing}", fail)
+    monkeypatch.setattr(f"bms_estimator.pack_model.slow_fit.{failing}", fail)
     second = await run_service(day[2 * HOUR : 5 * HOUR], tmp_path)
     assert second.estimator.state["samples"][0] == 3 * HOUR
     assert (tmp_path / "bike.refused.history.npz").exists()
@@ -359,7 +359,7 @@ async def test_forget_pack_starts_again_as_with_a_new_pack(day: SampleBlock, tmp
     with OneThread() as executor:
         source = Source(day[: 3 * HOUR + BLOCK], executor)
         forgetful = await run_service(day, tmp_path, source=source, fit_executor=executor, requests=requests)
-    new = new_estimator(SETTINGS, CELL)
+    new = compiled_estimator(SETTINGS, CELL)
     Pack(new, SlowFit(new)).run(day[3 * HOUR : 3 * HOUR + BLOCK])
     assert answers[0]["data"]["rows"] > 0
     assert forgetful.estimator.state["samples"][0] == 3 * HOUR + BLOCK  # the counters go on

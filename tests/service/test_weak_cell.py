@@ -11,8 +11,8 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model import learning
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model import slow_fit as slow_fit_module
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_bank import BankCells
@@ -69,7 +69,7 @@ def run() -> Run:
 @pytest.fixture(scope="module", autouse=True)
 def _fewer_fits() -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learning, "MIN_INTERVAL_S", FIT_S)
+        patch.setattr(slow_fit_module, "MIN_INTERVAL_S", FIT_S)
         yield
 
 

@@ -32,7 +32,7 @@ from bms_estimator.cli.options.capture_options import (
 )
 from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import load_pack, pack_or_cell, with_pack
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.identified_parameters import present_elements, relative_capacity
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -124,7 +124,7 @@ def _aging_history(files: StateFiles, settings: Settings, model: PackModel) -> A
                 None,
                 f"{file.path}: no fit yet; the service first fits capacity and resistances after half an hour of use.",
             )
-        cell = CellCurves(new_estimator(settings, model).cell_file_settings)
+        cell = CellCurves(compiled_estimator(settings, model).cell_file_settings)
         return AgingHistory(aging_course(cell, rows.rows, fit))
     except (RejectedFileError, OSError, ValueError) as error:
         return AgingHistory(None, f"{file.path} cannot be used: {error}.")

@@ -22,8 +22,8 @@ from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit, fit
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.learning import MAX_FAILED_FITS, has_enough_data, min_filter_std
 from bms_estimator.pack_model.saved import Arrays, history_arrays, history_of
+from bms_estimator.pack_model.slow_fit import MAX_FAILED_FITS, has_enough_data, min_filter_std
 
 NO_POSITION = RowsPosition(0, 0)
 

@@ -22,7 +22,7 @@ from bms_estimator.kernels.alarms import BROKEN_WIRE_V, LIMITS, NAMES, SETTINGS
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, assemble
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.alarm_limits import AlarmDefinition, min_charge_current_a, monitored_alarms, short_limit_a
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sampling import NO_LIMITS

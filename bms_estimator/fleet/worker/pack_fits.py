@@ -23,8 +23,8 @@ from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, FREE_ROWS
 from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import adopt_curves
-from bms_estimator.pack_model.learning import ADOPT_DELAY_S, fit_interval
 from bms_estimator.pack_model.saved import curve_arrays, fit_of_curves
+from bms_estimator.pack_model.slow_fit import ADOPT_DELAY_S, fit_interval
 
 MAX_CACHED_CURVES = 4096
 """Maximum number of packs of a partition whose curves are cached [13 kB each]. Other curves are computed with each block."""

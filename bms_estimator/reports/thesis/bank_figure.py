@@ -13,9 +13,9 @@ from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.bank_comparison import MIN_ROWS, SINCE_EARLIER, Comparison, Reference, ReferenceCurve
 from bms_estimator.pack_model.bank_monitor import is_discharge
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.learning import SlowFit
 from bms_estimator.pack_model.open_circuit import OpenCircuit, fitted_ocv, row_soc
 from bms_estimator.pack_model.saved import neutral_fit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 

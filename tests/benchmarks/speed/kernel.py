@@ -16,7 +16,7 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from tests.benchmarks.load import CELL, pulses
 from tests.benchmarks.speed.observer_in_c import ObserverInC

@@ -15,7 +15,7 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import identified_cell
 from bms_estimator.model.cell import CellModel
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.conftest import SHARED_DATA
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.use import DAY_S

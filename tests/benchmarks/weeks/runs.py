@@ -7,7 +7,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.benchmarks.weeks.parts import Part
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.use import DAY_S

@@ -15,7 +15,7 @@ import pytest
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.main import main
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.pack_model.fit import fit
 from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.saved import history_arrays
@@ -138,7 +138,7 @@ async def test_page_warns_of_the_history_of_an_earlier_pack_of_the_same_name(tmp
 def test_page_on_a_history_has_the_learned_parameters_of_the_checkpoint(tmp_path, capsys, steps_csv):
     (tmp_path / "pack.toml").write_text('[pack]\nname = "shed"\ncell = "ncr18650"\n')
     settings, model = load_pack(tmp_path / "pack.toml")
-    estimator = new_estimator(settings, model)
+    estimator = compiled_estimator(settings, model)
     estimator.run(load_capture(steps_csv).rows)
     StateFiles(tmp_path, settings, model).checkpoint.save(estimator.record)
     asyncio.run(record_history(tmp_path / "shed.sqlite", [snapshot_at(0.0), snapshot_at(90.0)]))

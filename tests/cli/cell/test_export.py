@@ -9,7 +9,7 @@ import pytest
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.cell import TableOcv, load_cell
 from tests.command_line import run
 from tests.estimator.anywhere.cases import OXIDE, Case, capture
@@ -39,7 +39,7 @@ def pack(tmp_path_factory) -> Path:
         f'[state]\nfolder = "{folder / "state"}"\n'
     )
     settings, cell = load_pack(file)
-    estimator = new_estimator(settings, cell)
+    estimator = compiled_estimator(settings, cell)
     estimator.run(simulate_discharge(1).samples)
     (folder / "state").mkdir()
     CheckpointFile(folder / "state", settings, cell).save(estimator.record)

@@ -20,7 +20,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, rising
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.truth import GRID, curve_of, measured_curve, simulate, smooth

@@ -12,7 +12,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.accuracy import bound
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.anywhere.score import Score, score
 from tests.estimator.anywhere.use import DAY_S
 from tests.estimator.month.cases import Case

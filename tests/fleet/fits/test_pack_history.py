@@ -21,7 +21,7 @@ from bms_estimator.fleet.worker.pack_state import PACK_STATE
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 from tests.estimator.simulated_cell import TRUTH, measured
 from tests.pack_model.test_bank_monitor import CURVES, FIT, discharges

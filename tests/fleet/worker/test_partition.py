@@ -12,7 +12,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.cli.fleet.packs import pack_files
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.estimator.estimator import make_estimator, new_estimator
+from bms_estimator.estimator.estimator import compiled_estimator, make_estimator
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
@@ -100,7 +100,7 @@ class MemoryCapture:
 
 async def test_final_state_equals_that_of_a_replay(stream, samples) -> None:
     deliver(stream, "a", blocks_of(samples))
-    replayed = new_estimator(SETTINGS, CELL)
+    replayed = compiled_estimator(SETTINGS, CELL)
     async for block, *_ in Replay(MemoryCapture(samples)):
         replayed.run(block)
     assert_state_equals(stream, "a", replayed.record)

@@ -18,7 +18,7 @@ from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.pack.pack import assemble
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter

@@ -17,7 +17,7 @@ from bms_estimator.kernels.kalman_filter.records import NODE, NODES, STATES
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model.learning import SlowFit
+from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, Case, cell_file, load_a
 from tests.estimator.anywhere.truth import simulate
 from tests.fit_interval import fits_every

@@ -16,10 +16,10 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model import fit as fit_module
-from bms_estimator.pack_model import learning
+from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import FitError, PackFit
-from bms_estimator.pack_model.learning import SlowFit, run_now
+from bms_estimator.pack_model.slow_fit import SlowFit, run_now
 from bms_estimator.settings.sampling import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
 from tests.pack_model.quick_fit import quick_fit
@@ -76,7 +76,7 @@ def test_there_is_no_fit_while_the_current_at_the_times_of_the_voltages_is_unkno
     period_s: int, is_fitted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A load changes every 20 s. Voltage and current come in turn, half a period apart."""
-    monkeypatch.setattr(learning, "fit", quick_fit)
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
     rng = np.random.default_rng(1)
     current_a = np.repeat(rng.uniform(0.0, 1.0, 900), 20) * TRUTH.cell.capacity_ah
     current_a[9000:] *= -1.0
@@ -84,13 +84,13 @@ def test_there_is_no_fit_while_the_current_at_the_times_of_the_voltages_is_unkno
     samples["status"][::2], samples["status"][1::2] = SampleStatus.CURRENT_HELD, SampleStatus.VOLTAGE_HELD
     slow_fit = SlowFit(Estimator(TRUTH, sampling=Sampling(period_s=period_s)), interval_s=INTERVAL_S)
     run(slow_fit, samples)
-    assert slow_fit.history.rows.size > 5 * learning.MIN_ROWS
+    assert slow_fit.history.rows.size > 5 * slow_fit_module.MIN_ROWS
     assert bool(slow_fit.fits) == is_fitted
 
 
 def test_fit_that_fails_leaves_the_previous_one_in_use(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
     fits: list[PackFit] = []
-    real_fit = learning.fit
+    real_fit = slow_fit_module.fit
 
     def first_fit_only(*args: object) -> PackFit:
         if fits:
@@ -99,7 +99,7 @@ def test_fit_that_fails_leaves_the_previous_one_in_use(samples: SampleBlock, mon
         fits.append(replace(first, covariance=0.1 * first.covariance))  # certain enough to be adopted
         return fits[0]
 
-    monkeypatch.setattr(learning, "fit", first_fit_only)
+    monkeypatch.setattr(slow_fit_module, "fit", first_fit_only)
     slow_fit, trace = run_in_parts(samples, (samples.size,))
     assert slow_fit.fit is fits[0]
     assert slow_fit.fits == 1
@@ -111,14 +111,14 @@ def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pyt
     """The charge since the fit's last row is subtracted. Covariances with the curve are in the filter's units."""
     slow_fit = new_slow_fit()
     adopted: list[tuple[np.ndarray, np.ndarray, float, float]] = []
-    adopt_state = learning.adopt_state
+    adopt_state = slow_fit_module.adopt_state
 
     def adopt_and_copy(estimator: Estimator, fitted: PackFit) -> None:
         adopt_state(estimator, fitted)
         f, h = estimator.record[0]["filter"], estimator.record[0]["history"]
         adopted.append((f["mean"][0].copy(), f["covariance"][0].copy(), float(h["charge_as"]), float(f["soc"])))
 
-    monkeypatch.setattr(learning, "adopt_state", adopt_and_copy)
+    monkeypatch.setattr(slow_fit_module, "adopt_state", adopt_and_copy)
     run(slow_fit, samples)
     mean, covariance, charge_as, soc = adopted[-1]
     fitted, p = slow_fit.fit, slow_fit.estimator.settings_record[0]["filter"]
@@ -152,7 +152,7 @@ def test_hypotheses_keep_their_soc_if_a_gap_followed_the_fit(samples: SampleBloc
     assert count > 1
     f["best"] = 1
     before = f["mean"][:count, SOC].copy()
-    learning.adopt_state(estimator, fitted)
+    slow_fit_module.adopt_state(estimator, fitted)
     assert f["count"] == count
     np.testing.assert_array_equal(f["mean"][:count, SOC], before)
     assert np.all(f["mean"][:count, LN_Q] == fitted.mean[fit_module.LN_Q])
@@ -169,7 +169,7 @@ def test_a_fit_of_less_than_a_cycle_is_adopted_only_if_its_std_is_small(
         fitted.covariance[fit_module.SOC, fit_module.SOC] = soc_std**2
         return fitted
 
-    monkeypatch.setattr(learning, "fit", fit_with_std)
+    monkeypatch.setattr(slow_fit_module, "fit", fit_with_std)
     slow_fit = new_slow_fit()
     begin = int(first_s)
     run(slow_fit, samples[:begin])
@@ -192,7 +192,7 @@ def test_a_fit_after_few_rows_and_restarts_does_not_enlarge_the_std(
     def filter_std() -> float:
         return float(slow_fit.estimator.record[0]["filter"]["soc_std"])
 
-    monkeypatch.setattr(learning, "fit", fit_with_std)
+    monkeypatch.setattr(slow_fit_module, "fit", fit_with_std)
     slow_fit = new_slow_fit()
     for start in range(6):
         part = samples[300 * start : 300 * (start + 1)]
@@ -213,9 +213,9 @@ def test_a_fit_after_a_certain_one_waits_until_the_history_has_grown(
     samples: SampleBlock, monkeypatch: pytest.MonkeyPatch, max_certain_std: float, waits: bool
 ) -> None:
     """The std of the SOC is 0.03."""
-    monkeypatch.setattr(learning, "fit", quick_fit)
-    monkeypatch.setattr(learning, "MIN_GROWTH", 0.3)
-    monkeypatch.setattr(learning, "MAX_CERTAIN_STD", max_certain_std)
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
+    monkeypatch.setattr(slow_fit_module, "MIN_GROWTH", 0.3)
+    monkeypatch.setattr(slow_fit_module, "MAX_CERTAIN_STD", max_certain_std)
     sizes: list[int] = []
 
     def submit(call: Callable[[], PackFit]) -> Future[PackFit]:
@@ -231,7 +231,7 @@ def test_a_fit_after_a_certain_one_waits_until_the_history_has_grown(
 
 
 def test_a_short_history_is_fitted_more_often(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learning, "fit", quick_fit)
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
     times_s: list[float] = []
 
     def submit(call: Callable[[], PackFit]) -> Future[PackFit]:
