@@ -40,8 +40,8 @@ _TEXTS = {
     "and that the source does not repeat an old value",
     InputFault.CURRENT: "the current stays the same to the last digit though the voltage changes: check the current sensor, "
     "and that all loads flow through it",
-    InputFault.LEVEL: "the voltage of the plateau lies farther from the OCV curve than in cells of this chemistry: measure the terminals "
-    "with a multimeter; if it differs, correct the voltage of the source, or else make a cell file with the curve of this cell "
+    InputFault.LEVEL: "the voltage of the plateau lies farther from the OCV curve than in cells of this chemistry: check the voltage "
+    "of the terminals with a multimeter; if it differs, correct the voltage of the source, or else make a cell file with the curve of this cell "
     "(bms-estimator ocv)",
     InputFault.PACK: "SOC or voltages after a gap do not fit the pack before it: check whether the pack "
     "was exchanged, because capacity and resistances were learned from the pack before; the request forget_pack discards them",

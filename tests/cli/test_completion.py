@@ -55,7 +55,7 @@ def complete(environment: dict[str, str], *words: str) -> list[str]:
 
 
 def test_bash_completes_commands(bash_home: dict[str, str]) -> None:
-    assert complete(bash_home, "re") == ["replay", "record", "report"]
+    assert complete(bash_home, "re") == ["replay", "record", "report", "restore"]
 
 
 def test_bash_completes_options(bash_home: dict[str, str]) -> None:

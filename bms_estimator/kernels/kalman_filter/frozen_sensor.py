@@ -21,9 +21,6 @@ FROZEN_S = 60.0
 """Duration of an implausibly constant input after which the input is reported as frozen [s]."""
 SWING_V = 0.02
 """Change of the voltage of one cell that proves a constant current frozen [V]."""
-ZERO_SWING_V = 0.05
-"""Change of the voltage of one cell that proves a current of exactly 0 frozen [V]. A parked pack reports exactly 0 for days, and a
-voltage with a coarse or noisy converter then changes by 20 mV without any load."""
 NOISE_STEPS = 4.0
 """Minimum change of the voltage for the proof that a constant current is frozen, in multiples of the mean change between two samples.
 The voltage follows a load for longer than one sample, so that its mean change is small. Noise changes it at each sample."""
@@ -70,7 +67,7 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
     if c.last_v == 0.0 or current_a != c.last_a:
         c.frozen_a_s = c.same_s = 0.0
         c.same_soc, c.same_soc_std = f.soc, f.soc_std
-    elif ocv_moved or (has_fast_changes and voltage_has_swung(c, p, counted_s, current_a, voltage_v, resolved_v)):
+    elif ocv_moved or (has_fast_changes and voltage_has_swung(c, p, counted_s, voltage_v, resolved_v)):
         c.frozen_a_s += counted_s
     elif c.frozen_a_s < FROZEN_S:  # discount single glitches at rest
         c.frozen_a_s -= c.frozen_a_s * min(1.0, counted_s / OUTLIERS_S)
@@ -80,14 +77,11 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
 
 
 @njit(cache=True)
-def voltage_has_swung(
-    c: Record, p: Record, counted_s: float, current_a: float, voltage_v: float, resolved_v: float
-) -> bool:
+def voltage_has_swung(c: Record, p: Record, counted_s: float, voltage_v: float, resolved_v: float) -> bool:
     """Return True if a voltage change under a constant current exceeds the noise, and update the mean change."""
     share = counted_s / min(max(c.same_s, counted_s), OUTLIERS_S)  # a mean over the time of the constant current
     c.noise_v += share * (abs(voltage_v - c.last_v) - c.noise_v)
-    swing_v = ZERO_SWING_V if current_a == 0.0 else SWING_V
-    limit_v = max(swing_v * p.series, resolved_v, NOISE_STEPS * c.noise_v)
+    limit_v = max(SWING_V * p.series, resolved_v, NOISE_STEPS * c.noise_v)
     return abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > limit_v
 
 

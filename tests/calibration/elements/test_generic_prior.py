@@ -25,7 +25,7 @@ def test_nearest_generic_cell_has_the_chemistry_of_the_curve(name, series_count)
 
 
 def test_nearest_generic_cell_of_a_real_layered_oxide_is_nca_or_nmc(data):
-    soc, ocv_v, _ = read_curve(data / "lgm50" / "ocv_25c.csv")
+    soc, ocv_v, *_ = read_curve(data / "lgm50" / "ocv_25c.csv")
     assert nearest_generic_cell(soc, ocv_v, 5.0, 1).cell.name in {"nca", "nmc"}
 
 
