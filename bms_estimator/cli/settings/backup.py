@@ -1,8 +1,10 @@
 """``bms-estimator backup`` and ``restore``: settings and learned state of a pack in one file, to move it to another machine."""
 
+import gzip
 import io
 import re
 import tarfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -52,13 +54,15 @@ def restore(file: Archive, pack: Pack) -> None:
     The settings of the archive are written if PACK.toml does not exist; otherwise they must have the same `pack.name`.
     A state that exists already is not replaced.
     """
-    with _reported(file), tarfile.open(file) as archive:
+    # decompressed whole, because tarfile does not check the checksum at the end
+    with _reported(file), tarfile.open(fileobj=io.BytesIO(gzip.decompress(file.read_bytes()))) as archive:
         contents = {member.name: _read(archive, member) for member in archive.getmembers() if member.isfile()}
     saved = {name.removeprefix(f"{STATE}/"): data for name, data in contents.items() if name.startswith(f"{STATE}/")}
     files = {Path(name).name: data for name, data in contents.items() if name.startswith(f"{SETTINGS}/")}
     if not saved or not files:
         raise UserError(f"{file}: is not an archive of bms-estimator backup")
-    text = next(iter(files.values())).decode()  # backup adds the settings file first
+    with _reported(file):
+        text = next(iter(files.values())).decode()  # backup adds the settings file first
     archived = parse_toml(text, Settings, str(file))
     settings = load_settings(pack) if pack.exists() else archived
     if settings.pack.name != archived.pack.name:
@@ -109,6 +113,6 @@ def _reported(path: Path) -> Iterator[None]:
     """Convert an error of a file or an archive to UserError."""
     try:
         yield
-    except (OSError, tarfile.TarError, EOFError) as error:
+    except (OSError, tarfile.TarError, EOFError, zlib.error, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         raise UserError(f"{path}: {reason}") from None

@@ -89,3 +89,16 @@ def test_a_file_that_is_no_archive_is_refused(pack, tmp_path, capsys):
         archive.add(pack, "home.toml")
     assert run(capsys, "restore", broken, pack)[2].startswith(f"error: {broken}: ")
     assert "is not an archive of bms-estimator backup" in run(capsys, "restore", foreign, pack)[2]
+
+
+@pytest.mark.parametrize("position", [40, 200, -20])
+def test_a_damaged_archive_is_refused(pack, tmp_path, capsys, position):
+    archive = tmp_path / "home.tar.gz"
+    (state_folder(load_settings(pack)) / "home.run").write_text("{}")
+    assert run(capsys, "backup", pack, archive)[0] == 0
+    content = bytearray(archive.read_bytes())
+    content[position : position + 8 or None] = b"\xff" * 8
+    archive.write_bytes(content)
+    code, _, err = run(capsys, "restore", archive, tmp_path / "second.toml")
+    assert code == 2
+    assert err.startswith(f"error: {archive}: ")
