@@ -81,7 +81,7 @@ def replay(
         float | None,
         typer.Option(
             parser=decimal(1e-3),
-            help="voltage at which the load is switched off, which ends the forecast [V]; default: cutoff_v of the pack",
+            help="voltage at which the load is switched off, which ends the forecast [V]; default: cut-off of the pack (pack.cutoff_v, otherwise pack.cutoff_voltage_v)",
             show_default=False,
         ),
     ] = None,
@@ -107,7 +107,8 @@ def replay(
 ) -> None:
     """Run the live service's estimator over a capture.
 
-    For a file of `run --record`, the estimates and the estimates of the recorded run are bit-identical.
+    For a file of `run --record`, the estimates are bit-identical with those of the recorded run, if it began without a
+    checkpoint and no fit was late.
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:

@@ -69,8 +69,8 @@ def accuracy(
 ) -> None:
     """Compute how well the SOC can be known in a use, and which change of the use or of the equipment helps most.
 
-    The result is a lower bound: the std that is left after any time if only the cell file is known. An estimator that states a smaller
-    std is wrong. With --cell, a pack without a temperature sensor is assumed.
+    The result is a lower bound: the std that remains however long the estimator runs, if it knows only the cell
+    file. On average over the cells that the file describes, no estimator has a smaller error. With --cell, a pack without a temperature sensor is assumed.
     """
     if pack is None and between is None:
         raise UserError("give --pack pack.toml, or --cell NAME with --between LOW HIGH")

@@ -163,8 +163,8 @@ def calibrate_command(
         float | None,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="SOC at the first sample of the captures that start at the highest voltage; default: 1 if their first rest "
-            "has the voltage of a full cell, otherwise by that voltage",
+            help="SOC 0..1 at the start of the captures that start at the highest voltage; default: 1 if their first rest shows "
+            "a full cell, otherwise from the voltage of that rest",
             show_default=False,
         ),
     ] = None,
@@ -206,7 +206,7 @@ def calibrate_command(
     """Calibrate a cell: measure its capacity, OCV, hysteresis and resistances, and write a cell file.
 
     The command recognizes slow discharges and charges, relaxation tests, HPPC and drive cycles.
-    One capture is enough. A capture for the OCV must begin with a full cell, or at the SOC given by --soc.
+    One capture is enough. A capture for the OCV should begin with a full cell; otherwise give --soc.
 
     With PACK.toml alone, the command reads the pack's device and gives instructions: charge, discharge, rest.
     It recognizes the end of each step by voltage and current, and records all samples.

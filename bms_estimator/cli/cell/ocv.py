@@ -115,7 +115,7 @@ def ocv(
         float | None,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="SOC at the first sample of the captures that start at the highest voltage; other captures start at an SOC that is read "
+            help="SOC 0..1 at the start of the captures that start at the highest voltage; the SOC of other captures is read "
             "from the OCV curve; default: 1, if that is the voltage of a full cell",
             show_default=False,
         ),

@@ -94,8 +94,8 @@ MappedColumns = Annotated[
         "--map",
         parser=parse_column_map,
         metavar="time=COLUMN,...",
-        help="columns of a table, or entities of a history, for some of time, current, voltage and temperature; a unit may "
-        "follow a name, as in 'time=Time \\[ms]'; sheet=SHEET chooses a sheet of a spreadsheet, and instance=NUMBER one of "
+        help="names of the columns of a table, or of the entities of a history, for one or more of time, current, voltage and "
+        "temperature; a unit may follow a name, as in 'time=Time \\[ms]'; sheet=SHEET chooses a sheet of a spreadsheet, and instance=NUMBER one of "
         "several batteries",
         show_default=False,
     ),
