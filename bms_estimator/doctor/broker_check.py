@@ -15,7 +15,7 @@ from bms_estimator.doctor.finding import Finding, Level, fault, ok, warning
 from bms_estimator.doctor.subject import Subject
 from bms_estimator.mqtt.broker_config import Broker, brokers
 from bms_estimator.mqtt.client import Timeouts
-from bms_estimator.mqtt.connection import BrokerConnectionError, Connection, ConnectOptions
+from bms_estimator.mqtt.connection import BrokerConnectionError, Connection, ConnectOptions, LoginError
 from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.process.systemd import is_for_the_service
@@ -83,7 +83,12 @@ async def _examine(settings: BrokerSettings, broker: Broker, pack_topic: str | N
                 findings += [finding async for finding in _examine_rights(connection, pack_topic)]
             return findings
     except BrokerConnectionError as error:
-        remedy = f"start the broker, or correct {settings.section}.url: nc -vz {broker.host} {broker.port}"
+        section = settings.section
+        remedy = (
+            f"correct {section}.username and the password in {section}.password_file"
+            if isinstance(error, LoginError)
+            else f"start the broker, or correct {section}.url: nc -vz {broker.host} {broker.port}"
+        )
         return [fault(NAME, f"{broker.url}: {error}", remedy)]
 
 

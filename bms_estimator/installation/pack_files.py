@@ -5,6 +5,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
+from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import Settings
 
@@ -17,20 +18,19 @@ def is_hidden(path: Path) -> bool:
     return any(path.is_relative_to(folder) for folder in HIDDEN_FOLDERS)
 
 
-def named_files(pack: Path, settings: Settings) -> list[Path]:
+def named_files(pack: Path) -> list[Path]:
     """Return the files that a pack's settings name and that must be copied with the pack file.
 
     The files are in the folder of the pack file. A name without such a file may be a systemd credential or a generic cell.
 
     Args:
         pack: Settings file of the pack.
-        settings: Its content.
 
     Raises:
-        UserError: A file is in a folder that the service cannot see.
+        UserError: The settings are invalid, or a file is in a folder that the service cannot see.
     """
     files = []
-    for key, name in _paths_in(settings):
+    for key, name in _paths_in(read_toml(pack, Settings)):
         if name.is_absolute():
             if is_hidden(name.resolve()):
                 raise UserError(

@@ -82,7 +82,7 @@ def _send(address: str, state: str) -> None:
 
 
 def credential(name: Path) -> Path:
-    """Return the path of this name in ``$CREDENTIALS_DIRECTORY`` if it exists there, else ``name`` itself."""
+    """Return the path of this file name in ``$CREDENTIALS_DIRECTORY`` if it exists there, else ``name`` itself."""
     path = Path(os.environ.get("CREDENTIALS_DIRECTORY", ""), name)
     return path if os.access(path, os.R_OK) else name
 

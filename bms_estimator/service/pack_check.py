@@ -17,7 +17,9 @@ from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.exports.influx import target
 from bms_estimator.sources.factory import make_line_producer
 
-ONLY_IN_SERVICE = "not checked, because a systemd credential exists only while the service runs"
+ONLY_IN_SERVICE = (
+    "not checked: no such file, unless it is a systemd credential, which exists only while the service runs"
+)
 """Warning about a credential file that only the running service can read."""
 
 BrokerSettings = TypeVar("BrokerSettings", MqttSettings, EdgeSettings)

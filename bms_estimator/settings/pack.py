@@ -1,9 +1,10 @@
 """Settings of one pack, from ``pack.toml``. The name of a setting with a unit ends in the unit."""
 
+import os
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, TypeVar
 
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
 
 from bms_estimator.model.config_file import Fraction, Positive, Strict, read_toml
 from bms_estimator.model.errors import UserError
@@ -25,6 +26,7 @@ SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource |
 
 _SOURCE_ADAPTER: TypeAdapter[SourceSettings] = TypeAdapter(SourceSettings)
 
+Section = TypeVar("Section", bound=BaseModel)
 MIN_RATE_HZ = 0.1
 """Minimum publish rate [Hz]."""
 MAX_RATE_HZ = 10.0
@@ -251,7 +253,7 @@ class Settings(Strict):
 
 
 def load_settings(path: Path) -> Settings:
-    """Read a pack's settings.
+    """Read a pack's settings. A file that they name and that is in the folder of the pack file gets this folder.
 
     Raises:
         UserError: The file cannot be read or is empty, or a setting is invalid.
@@ -259,4 +261,20 @@ def load_settings(path: Path) -> Settings:
     settings = read_toml(path, Settings)
     if not settings.model_fields_set:
         raise UserError(f"{path}: has no settings; was it cut off? `bms-estimator new` writes a new file")
-    return settings
+    return _with_folder(settings, path.parent)
+
+
+def _with_folder(section: Section, folder: Path) -> Section:
+    """Return settings in which each relative path of a file in a folder begins with this folder.
+
+    A systemd credential of the same name takes precedence.
+    """
+    changed: dict[str, BaseModel | Path] = {}
+    credentials = Path(os.environ.get("CREDENTIALS_DIRECTORY", os.devnull))
+    for key in section.model_fields_set:
+        value = getattr(section, key)
+        if isinstance(value, BaseModel):
+            changed[key] = _with_folder(value, folder)
+        elif isinstance(value, Path) and (folder / value).is_file() and not os.access(credentials / value, os.R_OK):
+            changed[key] = folder / value  # an absolute path remains as it is
+    return section.model_copy(update=changed) if changed else section

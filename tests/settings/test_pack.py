@@ -191,3 +191,21 @@ def test_an_integer_may_be_written_with_a_decimal_point(tmp_path: Path) -> None:
     path = tmp_path / "pack.toml"
     path.write_text("[pack]\nseries = 4.0\ncapacity_ah = 3\n")
     assert load_settings(path).pack.series == 4
+
+
+def test_a_file_beside_the_settings_is_found_from_any_folder_unless_a_credential_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pack, credentials, here = tmp_path / "pack.toml", tmp_path / "credentials", tmp_path / "here"
+    pack.write_text('[mqtt]\npassword_file = "password"\nca_file = "/absent/ca.pem"\n')
+    for folder in (credentials, here):
+        folder.mkdir()
+    monkeypatch.chdir(here)
+    assert load_settings(pack).mqtt.password_file == Path("password")
+    for folder in (tmp_path, here):
+        (folder / "password").write_text("secret")
+    settings = load_settings(pack).mqtt
+    assert (settings.password_file, settings.ca_file) == (tmp_path / "password", Path("/absent/ca.pem"))
+    (credentials / "password").write_text("secret")
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(credentials))
+    assert load_settings(pack).mqtt.password_file == Path("password")

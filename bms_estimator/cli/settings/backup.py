@@ -39,7 +39,7 @@ def backup(pack: Pack, file: Archive) -> None:
         content = io.BytesIO()
         with tarfile.open(fileobj=content, mode="w:gz") as archive:
             archive.add(pack, f"{SETTINGS}/{pack.name}")
-            for named in named_files(pack, settings):
+            for named in named_files(pack):
                 archive.add(named, f"{SETTINGS}/{named.name}")
             for each in files:
                 archive.add(each, f"{STATE}/{each.name}", recursive=False)

@@ -120,7 +120,7 @@ def _check(pack: Path) -> PackFiles:
     from bms_estimator.cli.settings.config import check  # noqa: PLC0415 - it loads numba, which an upgrade does not need
 
     check(pack)
-    return PackFiles(pack, named_files(pack, load_settings(pack)))
+    return PackFiles(pack, named_files(pack))
 
 
 def _program(machine: Machine) -> Path:

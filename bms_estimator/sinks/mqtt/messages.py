@@ -140,8 +140,10 @@ def _is_due(published: EntityStates, key: str, value: float | None, entity: Enti
     if key not in published.values:
         return True
     published_value, interval_passed = published.values[key], now_s - published.changed_s[key] >= entity.min_interval_s
-    if value is None or published_value is None:
-        return interval_passed and value is not published_value
+    if published_value is None:
+        return value is not None  # at once, because "unknown" is wrong from now on
+    if value is None:
+        return interval_passed
     min_change = entity.step if interval_passed else entity.immediate_step
     return round(abs(value - published_value), entity.decimals) >= min_change
 

@@ -185,6 +185,12 @@ def test_rare_change_is_published_within_five_seconds() -> None:
     assert published_s <= change_s + 5.0
 
 
+def test_a_first_value_is_published_within_five_seconds() -> None:
+    stream = ((t, cell_snapshot_with(temperature_c=None if t < 6.0 else 25.0)) for t in map(float, range(60)))
+    published_s = next(t for t, _, payload in home_assistant_messages(stream) if payload["temperature_c"] is not None)
+    assert published_s <= 11.0
+
+
 def test_values_are_rounded_to_their_resolution() -> None:
     values = cell_snapshot_with(voltage_v=3.7049999, soc_percent=56.7890123, remaining_energy_wh=1.23456789)
     payload = next(p for _, _, p in home_assistant_messages(iter([(0.0, values)])))
