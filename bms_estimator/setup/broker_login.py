@@ -11,7 +11,7 @@ from urllib.parse import quote, unquote
 
 from bms_estimator.mqtt.broker_config import parse_url
 
-FORM = "mqtt://host:port, or with a login mqtt://user:password@host:port; mqtts:// for TLS"
+FORM = "mqtt://host:port, or with a login mqtt://user:pw@host; mqtts:// for TLS"
 """Form of an address. Characters of the user name may be percent-encoded, because : and @ are separators."""
 _ADDRESS = re.compile(r"(mqtts?://)(?:([^:@/\s]*)(?::(.*))?@)?([^@/\s]+)")
 

@@ -61,7 +61,7 @@ def ingest(
         float, typer.Option(min=0.001, help="maximum size of the batches that wait on the server [GB]")
     ] = 1.0,
 ) -> None:
-    """Receive batches of samples from a telemetry platform, in place of the edges of its packs, until SIGINT or SIGTERM.
+    """Receive batches of samples from a telemetry platform, in place of the edges of its packs, until SIGINT, SIGTERM or SIGHUP.
 
     The platform publishes a batch, JSON or Arrow, on the NATS subject telemetry.PACK or the MQTT topic telemetry/PACK.
     """

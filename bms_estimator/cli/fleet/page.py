@@ -36,7 +36,7 @@ def page(
     ] = None,
     browser: Browser = True,
 ) -> None:
-    """Serve a web page of all packs of a fleet, until SIGINT or SIGTERM."""
+    """Serve a web page of all packs of a fleet, until SIGINT, SIGTERM or SIGHUP."""
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
     configure_logs()
     with flush_logs():

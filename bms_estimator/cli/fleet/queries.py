@@ -29,7 +29,7 @@ def collect(
         float, typer.Option(min=0.0, help="write a row to a file at most this many seconds after its arrival")
     ] = 300.0,
 ) -> None:
-    """Write the hourly summaries of all packs, which the workers publish, to Parquet files, until SIGINT or SIGTERM."""
+    """Write the hourly summaries of all packs, which the workers publish, to Parquet files, until SIGINT, SIGTERM or SIGHUP."""
     from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
     from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
 

@@ -33,7 +33,7 @@ def worker(
         float, typer.Option(min=1.0, help="interval in seconds between two checkpoints of the same partition")
     ] = CHECKPOINT_S,
 ) -> None:
-    """Run a worker, which estimates the packs of some partitions, until SIGINT or SIGTERM.
+    """Run a worker, which estimates the packs of some partitions, until SIGINT, SIGTERM or SIGHUP.
 
     The packs of a tenant are divided into partitions, which its workers share among themselves.
     """

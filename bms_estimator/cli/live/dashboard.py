@@ -41,7 +41,7 @@ def dashboard(
     ] = None,
     browser: Browser = True,
 ) -> None:
-    """Serve a live web page of all packs that publish to an MQTT broker, until SIGINT or SIGTERM."""
+    """Serve a live web page of all packs that publish to an MQTT broker, until SIGINT, SIGTERM or SIGHUP."""
     settings = load_settings(pack) if pack else Settings()
     broker = (with_broker(settings, mqtt) if mqtt else settings).mqtt or MqttSettings()
     page = page_settings(settings.page or PageSettings(), listen=listen, token_file=token_file)

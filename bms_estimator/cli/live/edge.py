@@ -40,7 +40,7 @@ log = structlog.get_logger(__name__)
 async def serve_edge(
     settings: Settings, folder: Path, *, stop: asyncio.Event | None = None, notifier: SystemdNotifier | None = None
 ) -> None:
-    """Send samples until SIGINT or SIGTERM.
+    """Send samples until SIGINT, SIGTERM or SIGHUP.
 
     Args:
         settings: The pack's settings, with ``[edge]``.
@@ -111,7 +111,7 @@ def edge(
     ),
     port: OtherPort = None,
 ) -> None:
-    """Send a pack's raw samples to a fleet server until SIGINT or SIGTERM.
+    """Send a pack's raw samples to a fleet server until SIGINT, SIGTERM or SIGHUP.
 
     The fleet's workers estimate SOC and parameters from the samples.
     Samples are stored on disk until the server confirms them (docs/fleet/edge.md).

@@ -47,7 +47,7 @@ def run(
 ) -> None:
     """Run the live service: estimate from a BMS, battery monitor or sensor board, and publish the estimates.
 
-    The service runs until SIGINT or SIGTERM.
+    The service runs until SIGINT, SIGTERM or SIGHUP.
     One process may serve several packs, each with its own device and broker connection.
     """
     paths = packs or [Path("pack.toml")]

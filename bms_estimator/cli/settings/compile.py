@@ -11,8 +11,8 @@ from bms_estimator.service.kernel_compilation import COMPLETE_FILE
 def compile_command() -> None:
     """Compile the kernels, so that no later start does.
 
-    The folder is $NUMBA_CACHE_DIR, or the cache folder of the user. An image sets the variable to the folder `compiled` in
-    the folder of the package.
+    They are stored in $NUMBA_CACHE_DIR, or else in your cache folder. The service uses
+    /var/cache/bms-estimator. Debian package and Docker images are built with kernels in the folder `compiled` of the program.
     """
     if CACHE_FOLDER is None:
         raise UserError("no folder for compiled kernels can be written: set NUMBA_CACHE_DIR=FOLDER")

@@ -44,14 +44,14 @@ def new(
         list[str] | None,
         typer.Option(
             "--search",
-            help="where to search: path of a serial port, URL of an MQTT broker (mqtt://user:password@host), host name of a Modbus device, or bluetooth; may be repeated; default: all USB serial ports, the MQTT broker on this machine, Bluetooth",
+            help="where to search: path of a serial port, URL of an MQTT broker (mqtt://user:pw@host), host name of a Modbus device, or bluetooth; may be repeated; default: all USB serial ports, the MQTT broker on this machine, Bluetooth",
             show_default=False,
         ),
     ] = None,
     device: Annotated[
         str | None,
         typer.Option(
-            help="path of a serial port, which is then the only place that is searched, or name of a found device"
+            help="path of a serial port, which is then the only place that is searched, or name of a found device, such as esphome-jk:jk-bms"
         ),
     ] = None,
     compare: Annotated[
@@ -77,12 +77,20 @@ def new(
     ] = None,
     name: Annotated[str | None, typer.Option(help=QUESTIONS[0].help, show_default=False)] = None,
     cell: Annotated[str | None, typer.Option(help=QUESTIONS[1].help, show_default=False)] = None,
-    capacity_ah: Annotated[str | None, typer.Option(help=QUESTIONS[2].help, show_default=False)] = None,
-    series: Annotated[str | None, typer.Option(help=QUESTIONS[3].help, show_default=False)] = None,
-    parallel: Annotated[str | None, typer.Option(help=QUESTIONS[4].help, show_default=False)] = None,
-    max_discharge_a: Annotated[str | None, typer.Option(help=QUESTIONS[5].help, show_default=False)] = None,
-    max_charge_a: Annotated[str | None, typer.Option(help=QUESTIONS[6].help, show_default=False)] = None,
-    device_soc_std: Annotated[str | None, typer.Option(help=QUESTIONS[7].help, show_default=False)] = None,
+    capacity_ah: Annotated[
+        str | None, typer.Option(metavar="<float>", help=QUESTIONS[2].help, show_default=False)
+    ] = None,
+    series: Annotated[str | None, typer.Option(metavar="<int>", help=QUESTIONS[3].help, show_default=False)] = None,
+    parallel: Annotated[str | None, typer.Option(metavar="<int>", help=QUESTIONS[4].help, show_default=False)] = None,
+    max_discharge_a: Annotated[
+        str | None, typer.Option(metavar="<float>", help=QUESTIONS[5].help, show_default=False)
+    ] = None,
+    max_charge_a: Annotated[
+        str | None, typer.Option(metavar="<float>", help=QUESTIONS[6].help, show_default=False)
+    ] = None,
+    device_soc_std: Annotated[
+        str | None, typer.Option(metavar="<float>", help=QUESTIONS[7].help, show_default=False)
+    ] = None,
     broker: Annotated[str | None, typer.Option(help=QUESTIONS[8].help, show_default=False)] = None,
     estimate: Annotated[
         bool, typer.Option("--estimate/--no-estimate", help="run the estimator for some seconds, and show the SOC")
