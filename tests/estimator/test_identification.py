@@ -132,11 +132,12 @@ def test_a_long_gap_preserves_the_capacity_and_the_constant_part_of_the_offset(l
     p = estimator.settings_record[0]["filter"]
     estimator.resume(0.1 * p["offset_s"])  # a tenth of the time constant of the offset
     estimator.run(load_and_soc[0][-1:])
-    mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]]
+    # of an event in the gap: in a rest the voltage before and after it shows the offset
+    mean, covariance = f["mean"][0], f["covariance"][0]
     assert mean[LN_Q] == pytest.approx(ln_q, rel=0.2)
     assert covariance[LN_Q, LN_Q] == pytest.approx(first[LN_Q, LN_Q], rel=0.2)
     assert covariance[LN_Q, LN_Q] < p["capacity_std"] ** 2
-    assert abs(mean[OFFSET] - np.exp(-0.1) * offset_a) < 0.2 * np.sqrt(first[OFFSET, OFFSET])
+    assert abs(mean[OFFSET] - np.exp(-0.1) * offset_a) < 0.1 * np.sqrt(first[OFFSET, OFFSET])
     prior_variance = offset_variance(p)
     expected_variance = prior_variance - np.exp(-0.2) * (prior_variance - first[OFFSET, OFFSET])
     assert covariance[OFFSET, OFFSET] == pytest.approx(expected_variance, rel=0.05)
