@@ -241,15 +241,16 @@ async def test_server_stores_again_after_its_disk_was_full(tmp_path: Path, monke
         spec = ServerSpec(FleetSettings(server=settings))
         task = asyncio.create_task(serve_node(NodeLocation(disk / "state"), lambda: spec, lines.append))
         await until(lambda: any("streams ready" in line for line in lines) or task.done())
+        filler = disk / "filler"
+        with contextlib.suppress(OSError), filler.open("wb") as file:
+            while True:
+                file.write(bytes(1 << 20))
         async with await nats.connect(f"nats://{ports['listen']}") as nc:
-            filler = disk / "filler"
-            with contextlib.suppress(OSError), filler.open("wb") as file:
-                while True:
-                    file.write(bytes(1 << 20))
             await nc.publish(subjects.raw("a"), bytes(200_000))
-            await until(lambda: any(line["event"].startswith("the disk is full") for line in logs))
-            filler.unlink()
-            await until(lambda: sum("streams ready" in line for line in lines) == 2)
+            await nc.flush()
+        await until(lambda: any(line["event"].startswith("the disk is full") for line in logs))
+        filler.unlink()
+        await until(lambda: sum("streams ready" in line for line in lines) == 2)
         async with await nats.connect(f"nats://{ports['listen']}") as nc:
             await nc.jetstream(timeout=LONG_S).publish(subjects.raw("a"), b"stored again")
         assert not task.done()
