@@ -172,7 +172,7 @@ class PackAlarms:
         yield _message(present)
 
     def _events(self, pack_type: PackType) -> Iterator[EventText]:
-        """Yield the events beside those of the alarms since the last call."""
+        """Yield the events since the last call that no alarm causes."""
         slow_fit, record = pack_type.pack.slow_fit, self._estimator[0]
         if slow_fit and slow_fit.changes > self._fits and (change := last_change(slow_fit)):
             yield fit_event(change)

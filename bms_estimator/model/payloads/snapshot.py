@@ -1,4 +1,4 @@
-"""Payloads of one publication: those of the topics ``forecast``, ``cells``, ``info``, ``alarm/<name>`` and ``parameters``.
+"""Payloads of one publication, for the topics ``forecast``, ``cells``, ``info``, ``alarm/<name>`` and ``parameters``.
 
 ``estimate`` and ``health`` define the two other ones.
 """
