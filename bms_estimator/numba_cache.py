@@ -150,7 +150,8 @@ class _KernelCache(NullCache):
     """Cache of a kernel, in one file for each signature and minor version of Python.
 
     numba's own cache depends on the absolute path of the source file, so that each installation would compile the kernels
-    again, and it has one folder, which must be writable.
+    again, and it has one folder, which must be writable. The file of a kernel outside this package carries a hash of its source
+    file. Such a kernel may call kernels of that file and of this package.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -158,7 +159,10 @@ class _KernelCache(NullCache):
         name = (
             f"{source.stem}.{function.__qualname__}-{code.co_firstlineno}.py{sys.version_info[0]}{sys.version_info[1]}"
         )
-        self._path = source.parent.relative_to(_PACKAGE) / name if source.is_relative_to(_PACKAGE) else None
+        if source.is_relative_to(_PACKAGE):
+            self._path = source.parent.relative_to(_PACKAGE) / name
+        else:
+            self._path = Path("outside") / hashlib.sha256(source.read_bytes()).hexdigest()[:16] / name
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return the compiled kernel; None if it must be compiled."""
@@ -186,8 +190,8 @@ class _KernelCache(NullCache):
                 new.unlink(missing_ok=True)
 
     def _file(self, folder: Path | None, signature: Any, codegen: Any) -> Path | None:
-        """Return the file of a signature's machine code; None without a folder, or for a function of another package."""
-        if folder is None or self._path is None:
+        """Return the file of a signature's machine code; None without a folder."""
+        if folder is None:
             return None
         key = hashlib.sha256(repr((tuple(signature), codegen.magic_tuple())).encode()).hexdigest()[:16]
         return folder / f"{self._path}.{key}.nbc"

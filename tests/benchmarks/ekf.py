@@ -29,13 +29,13 @@ COLD_C = 0.0
 dependent resistance of the cell file [C]."""
 
 
-@njit()
+@njit(cache=True)
 def _ocv_slope(soc: float, grid: Floats) -> float:
     """Return the slope of the OCV by a central difference [V]."""
     return (ocv(soc + SOC_STEP, grid[0], grid[1]) - ocv(soc - SOC_STEP, grid[0], grid[1])) / (2.0 * SOC_STEP)
 
 
-@njit()
+@njit(cache=True)
 def fixed_ekf(
     time_s: Floats, current_a: Floats, voltage_v: Floats, soc0: float, cell: Floats, grid: Floats
 ) -> tuple[Floats, Floats]:
@@ -105,7 +105,7 @@ def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]
     return weak + strong, ln_ratio / math.log(arrhenius(1.0, COLD_C))
 
 
-@njit()
+@njit(cache=True)
 def ladder_ekf(
     time_s: Floats,
     current_a: Floats,

@@ -121,6 +121,25 @@ def test_a_kernel_that_another_process_compiles_is_not_compiled_again(tmp_path: 
             assert second.stdout.readline() == "33984 0\n"
 
 
+OUTSIDE_KERNEL = """
+from bms_estimator.numba_cache import njit
+@njit(cache=True)
+def tripled(x): return {factor} * x
+"""
+"""Source of a kernel that is not in the package."""
+
+
+def test_a_kernel_outside_the_package_is_compiled_once_for_each_content_of_its_file(tmp_path: Path) -> None:
+    script = "from outside import tripled; print(tripled(2.0), sum(tripled.stats.cache_hits.values()))"
+    variables = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+    printed = []
+    for factor in ("3.0", "3.0", "30.0"):
+        (tmp_path / "outside.py").write_text(OUTSIDE_KERNEL.format(factor=factor))
+        command = [sys.executable, "-c", script]
+        printed.append(subprocess.check_output(command, env=os.environ | variables, text=True))
+    assert printed == ["6.0 0\n", "6.0 1\n", "60.0 0\n"]
+
+
 @pytest.fixture(scope="module")
 def cached_kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a cache folder with a compiled kernel."""

@@ -82,7 +82,7 @@ def write_capture(path: Path, block: SampleBlock) -> None:
             file.write(records.tobytes())
 
 
-@njit()
+@njit(cache=True)
 def _write_checksums(records):
     """Write the CRC at the end of each record; shape (n, bytes)."""
     for j in range(records.shape[0]):
