@@ -12,7 +12,7 @@ import pytest
 
 from bms_estimator.checkpoint import arrays_file, run_file, state_files
 from bms_estimator.edge import block
-from bms_estimator.fleet.worker.checkpoint import format_versions
+from bms_estimator.fleet.worker.checkpoint import checkpoint_format
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.cells.records import BANK, CELL
 from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
@@ -21,7 +21,7 @@ from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
 def test_formats_have_their_numbers() -> None:
     assert (state_files.FORMER_FORMAT, state_files.FORMAT) == (7, 8)
     assert (arrays_file.FORMAT, run_file.FORMAT) == (1, 1)
-    assert (format_versions.FORMAT, format_versions.INCREMENT_FORMAT) == (3, 3)
+    assert (checkpoint_format.FORMAT, checkpoint_format.INCREMENT_FORMAT) == (3, 3)
     assert (block.VERSION, PAYLOAD_VERSION) == (3, 3)
 
 

@@ -20,7 +20,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
-from bms_estimator.fleet.packs.pack_bucket import write_bucket
+from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
@@ -86,6 +86,15 @@ async def load_packs(nc: Client, packs: list[str]) -> PackRegistry:
     for pack in packs:
         registry.set_row(pack, PACK_ROW)
     return registry
+
+
+async def until_table(nc: Client, rows: Mapping[str, bytes]) -> None:
+    """Wait until the table of packs consists of ``rows``."""
+    async with asyncio.timeout(LONG_S):
+        while True:
+            if await read_bucket(nc, subjects.PACKS_BUCKET) == rows:
+                return
+            await asyncio.sleep(0.1)
 
 
 async def send(nc: Client, pack: str, data: bytes) -> None:

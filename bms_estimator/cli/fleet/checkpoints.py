@@ -69,7 +69,7 @@ def restore(
 
 def _day_rows(pointers: "Iterable[Pointer]") -> list[tuple[object, ...]]:
     """Return a row for each day, the newest first."""
-    from bms_estimator.fleet.worker.checkpoint.daily_restore import day_of  # noqa: PLC0415 - NATS is optional
+    from bms_estimator.fleet.worker.checkpoint.admin_changes import day_of  # noqa: PLC0415 - NATS is optional
 
     sizes = defaultdict[date, list[int]](list)
     for pointer in pointers:
@@ -104,7 +104,7 @@ def _megabytes(size: int) -> str:
 
 async def _read(address: ServerAddress) -> "dict[int, Pointer]":
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.worker.checkpoint.daily_restore import read_pointers  # noqa: PLC0415
+    from bms_estimator.fleet.worker.checkpoint.admin_changes import read_pointers  # noqa: PLC0415
 
     async with connected(*address) as nc:
         return await read_pointers(nc)
@@ -114,7 +114,7 @@ async def _restore(
     address: ServerAddress, day: date, partitions: frozenset[int], *, skip_blocks: bool
 ) -> "Mapping[int, CheckpointInfo]":
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.worker.checkpoint.daily_restore import restore_day  # noqa: PLC0415
+    from bms_estimator.fleet.worker.checkpoint.admin_changes import restore_day  # noqa: PLC0415
 
     async with connected(*address) as nc:
         return await restore_day(nc, day, partitions, skip_blocks=skip_blocks)

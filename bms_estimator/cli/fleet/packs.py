@@ -19,7 +19,7 @@ from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
-    from bms_estimator.fleet.worker.checkpoint.erasure import Erasure
+    from bms_estimator.fleet.worker.checkpoint.admin_changes import Erasure
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -218,7 +218,7 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
 
 async def _erase_from_server(packs: list[str], address: ServerAddress) -> "dict[str, Erasure]":
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.worker.checkpoint.erasure import erase_packs  # noqa: PLC0415
+    from bms_estimator.fleet.worker.checkpoint.admin_changes import erase_packs  # noqa: PLC0415
 
     async with connected(*address) as nc:
         return await erase_packs(nc, set(packs))

@@ -14,7 +14,6 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 
-import nats.errors
 import nats.js.errors
 import numpy as np
 import structlog
@@ -28,8 +27,8 @@ from pydantic import ValidationError
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import FitRequest
 from bms_estimator.fleet.fits.pack_history import FitAnswer, FitJob, run_job
-from bms_estimator.fleet.nats.connection import close, connect, error_text
-from bms_estimator.fleet.nats.stream_reader import StreamError, read_stream
+from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, close, connect, error_text
+from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.model.errors import TemporaryError
@@ -50,8 +49,6 @@ MAX_DELIVERIES = 5
 after the interval between two fits."""
 STATUS_S = 60.0
 """Interval between two log lines with the counters [s]."""
-_ERRORS = (nats.errors.Error, nats.js.errors.Error, StreamError, TimeoutError)
-"""Errors of the connection or the server after which a request is answered later."""
 
 log = structlog.get_logger(__name__)
 
@@ -122,7 +119,7 @@ class Fitter:
                 subscription = subscription or await self._subscribe()
                 messages = await self._fetch(subscription)
                 await asyncio.gather(*map(self._answer, messages))
-            except _ERRORS as error:
+            except RETRYABLE_ERRORS as error:
                 if self._nc.is_closed:
                     raise TemporaryError("the server has closed the connection: check --creds") from None
                 subscription = None

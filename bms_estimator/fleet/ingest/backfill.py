@@ -17,8 +17,8 @@ from bms_estimator.fleet.ingest.arrow_batch import columns_of
 from bms_estimator.fleet.ingest.batch_columns import BatchError
 from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
-from bms_estimator.fleet.ingest.startup import RETRY_S, RETRYABLE_ERRORS, Options, open_ingest
-from bms_estimator.fleet.nats.connection import error_text
+from bms_estimator.fleet.ingest.startup import Options, open_ingest
+from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.tasks import until_first_ends

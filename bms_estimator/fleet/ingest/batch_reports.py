@@ -6,13 +6,12 @@ import time
 from collections import Counter
 
 import nats.errors
-import nats.js.errors
 import structlog
 from nats.aio.client import Client
 from pydantic import BaseModel, ConfigDict
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.connection import error_text
+from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.nats.dead_letters import DeadLetter, one_line
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
@@ -114,7 +113,7 @@ class BatchReports:
         for _ in range(ATTEMPTS):
             try:
                 await self._nc.jetstream().publish(letter.subject, letter.data, headers=letter.headers())
-            except (nats.errors.Error, nats.js.errors.Error, TimeoutError) as error:
+            except RETRYABLE_ERRORS as error:
                 reason = error_text(error)
                 await asyncio.sleep(RETRY_S)
             else:

@@ -5,15 +5,13 @@ import contextlib
 import math
 from collections.abc import Sequence
 
-import nats.errors
-import nats.js.errors
 import structlog
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block_store import RESEND_S
 from bms_estimator.fleet.ingest.store_table import BlockPage, StoredBlock
-from bms_estimator.fleet.nats.connection import error_text
+from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text
 from bms_estimator.store.database import Database, StoreError
 
 PAGE_BLOCKS = 500
@@ -72,7 +70,7 @@ class BlockPublisher:
 
     async def send_again(self, pack: str, number: int) -> None:
         """Send one block of a pack again, to which a worker replies. Errors are ignored, because the caller repeats the call."""
-        with contextlib.suppress(nats.errors.Error, nats.js.errors.Error, TimeoutError, StoreError):
+        with contextlib.suppress(*RETRYABLE_ERRORS, StoreError):
             page = await self._database.call(BlockPage(1, pack=pack, first=number))
             await self._publish([block for block in page if block.id <= self.sent])
 
@@ -83,7 +81,7 @@ class BlockPublisher:
             try:
                 while await self._resend_requested() or await self._send_next():
                     pass
-            except (nats.errors.Error, nats.js.errors.Error, TimeoutError, StoreError) as error:
+            except (*RETRYABLE_ERRORS, StoreError) as error:
                 self._log_trouble(error_text(error))
                 await asyncio.sleep(RETRY_S)
                 continue
@@ -120,7 +118,7 @@ class BlockPublisher:
         """Publish blocks, and wait until the stream has stored them.
 
         Raises:
-            nats.errors.Error, nats.js.errors.Error, TimeoutError: Not all of them are stored.
+            nats.errors.Error, TimeoutError: Not all of them are stored.
         """
         acks = []
         try:

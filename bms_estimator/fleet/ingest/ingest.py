@@ -14,9 +14,9 @@ from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, c
 from bms_estimator.fleet.ingest.batch_reports import BatchReport, BatchReports
 from bms_estimator.fleet.ingest.batch_samples import BatchReader, drop_reason, split_by_time
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
-from bms_estimator.fleet.ingest.startup import NAME, RETRY_S, RETRYABLE_ERRORS, Options, open_ingest
+from bms_estimator.fleet.ingest.startup import NAME, Options, open_ingest
 from bms_estimator.fleet.ingest.telemetry_reader import DamagedStreamError, MissingStreamError, TelemetryReader
-from bms_estimator.fleet.nats.connection import error_text
+from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.nats.streams import make_telemetry_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket

@@ -9,16 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nats.errors
-import nats.js.errors
 import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
-from bms_estimator.fleet.nats.connection import close, connect, error_text
-from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.fleet.nats.streams import NoAnswerError, make_telemetry_stream, partitions_of
+from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, close, connect, error_text
+from bms_estimator.fleet.nats.streams import make_telemetry_stream, partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.model.sample import CurrentSign
@@ -27,12 +25,8 @@ from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 NAME = "ingest"
 """Name of the process, for systemd and the server."""
-RETRY_S = 1.0
-"""Retry interval after an error of the server [s]."""
 PRESENCE_TIMEOUT_S = 1.0
 """Timeout of the request to another process [s]. The server rejects the request at once if no process runs."""
-RETRYABLE_ERRORS = (nats.errors.Error, nats.js.errors.Error, StreamError, NoAnswerError, TimeoutError)
-"""Errors of the connection or the server after which a request is repeated."""
 
 log = structlog.get_logger(__name__)
 

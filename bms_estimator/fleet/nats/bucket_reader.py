@@ -17,6 +17,9 @@ class BucketReader:
     Args:
         nc: Connection to the tenant's NATS account.
         bucket: Name of the bucket.
+
+    Attributes:
+        lost: Keys that were read before, and that the bucket lacks since the server has lost it.
     """
 
     def __init__(self, nc: Client, bucket: str) -> None:
@@ -24,6 +27,7 @@ class BucketReader:
         self._next_sequence = 1
         self._created: object = None  # creation time of the stream with this sequence number
         self._keys = set[str]()  # also those whose removal is marked
+        self.lost = set[str]()
 
     async def read(self, set_value: Callable[[str, bytes | None], object]) -> None:
         """Call ``set_value`` with each changed key and its value; None: the key was removed.
@@ -50,6 +54,7 @@ class BucketReader:
             last = batch[-1].sequence
         for key in self._keys - found if is_purged else ():
             set_value(key, None)
+        self.lost = (self.lost | self._keys if is_other else self.lost) - found
         self._keys = found if first == 1 else self._keys | found
         self._next_sequence, self._created = last + 1, info.created
 

@@ -17,7 +17,7 @@ class CheckpointInfo(BaseModel):
     made_s: float
     """Wall clock at which the last of the objects was written [s since 1970]."""
     format: int = 1
-    """Format of the bytes (``format_versions.FORMAT``); versions without this field wrote format 1."""
+    """Format of the bytes (``checkpoint_format.FORMAT``); versions without this field wrote format 1."""
     increments: tuple[str, ...] = ()
     """Names of further objects, each of which contains the packs that were changed since the object before it."""
     increment_bytes: int = 0

@@ -16,6 +16,7 @@ import structlog
 from nats.aio.client import Client
 from nats.aio.transport import TcpTransport
 
+from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
 
 _TEXT_BY_CLASS: dict[type[BaseException], str] = {
@@ -41,8 +42,12 @@ AUTH_TIMEOUT_S = 10
 """Timeout of each authentication step [s], long enough for a slow line or many simultaneous reconnects. The server's
 default is 2 s."""
 
-RETRY_S = 1
+CONNECT_RETRY_S = 1
 """Delay between two connection attempts [s]."""
+RETRY_S = 0.5
+"""Retry interval of server requests [s]."""
+RETRYABLE_ERRORS = (nats.errors.Error, TimeoutError, StreamError)
+"""Errors of the connection or the server after which a request is repeated."""
 PING_S = 10
 """Ping interval [s]. After two unanswered pings the client reconnects."""
 FLUSH_TIMEOUT_S = 5.0
@@ -106,7 +111,7 @@ async def connect(
             user_credentials=str(check_credentials_file(creds)) if creds else None,
             tls=tls_context(ca) if ca else None,
             max_reconnect_attempts=-1,
-            reconnect_time_wait=RETRY_S,
+            reconnect_time_wait=CONNECT_RETRY_S,
             ping_interval=PING_S,
             connect_timeout=AUTH_TIMEOUT_S,
             flush_timeout=FLUSH_TIMEOUT_S,

@@ -7,7 +7,9 @@ from types import MappingProxyType
 
 import nats.errors
 import nats.js.errors
+import structlog
 from nats.aio.client import Client
+from nats.js.errors import KeyWrongLastSequenceError
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.nats.bucket_reader import BucketReader, entry, stream_of, subject_of
@@ -18,6 +20,8 @@ POLL_S = 1.0
 """Poll interval for changes [s]."""
 MAX_PENDING = 2000
 """Maximum number of written rows that wait for the server's acknowledgment."""
+
+log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class PackBucket:
     """
 
     def __init__(self, nc: Client) -> None:
-        self.packs = PackRegistry()
+        self._nc, self.packs = nc, PackRegistry()
         self.faults, self.fault = 0, ""
         self._readers = {bucket: BucketReader(nc, bucket) for bucket in (CELLS_BUCKET, PACKS_BUCKET)}
         self._changed: dict[str, set[str]] = {PACKS_BUCKET: set(), CELLS_BUCKET: set()}
@@ -72,18 +76,30 @@ class PackBucket:
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
         """Poll for changes until cancelled; call ``changed`` with the packs whose row or cell has changed.
 
-        A failed poll is counted, and the next one includes its changes.
+        A failed poll is counted, and the next one includes its changes. If the server has lost the table, it is written again.
         """
         while True:
             await asyncio.sleep(POLL_S)
             try:
-                packs = await self.refresh()
+                if packs := await self.refresh():
+                    changed(packs)
+                await self._write_lost()
             except (StreamError, nats.errors.Error) as error:
                 self.faults, self.fault = self.faults + 1, str(error)
                 continue
             self.fault = ""
-            if packs:
-                changed(packs)
+
+    async def _write_lost(self) -> None:
+        """Write the values that the server has lost, unless another process has written or removed them since.
+
+        Raises:
+            StreamError: The server does not respond or rejects the request. The next call writes them.
+        """
+        for bucket, values in ((CELLS_BUCKET, self.packs.cell_files), (PACKS_BUCKET, self.packs.rows)):
+            if lost := self._readers[bucket].lost & values.keys():
+                await put_new(self._nc, bucket, {key: values[key] for key in lost})
+                log.error("the server has lost the table of packs: it is written again", bucket=bucket, rows=len(lost))
+            self._readers[bucket].lost.clear()
 
 
 async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
@@ -168,4 +184,21 @@ async def put(
             async with asyncio.timeout(RESPONSE_TIMEOUT_S):
                 await asyncio.gather(*acks)
     except (TimeoutError, nats.errors.Error, nats.js.errors.Error) as error:
+        raise StreamError(f"the server does not store rows of {bucket}: {error}") from None
+
+
+async def put_new(nc: Client, bucket: str, values: Mapping[str, bytes]) -> None:
+    """Write the values of keys that the bucket lacks. Keys that exist or are marked as removed do not change.
+
+    Raises:
+        StreamError: The server does not respond or rejects the request.
+    """
+    try:
+        key_value, entries = await nc.jetstream().key_value(bucket), list(values.items())
+        for first in range(0, len(entries), MAX_PENDING):
+            writes = (key_value.update(key, data, 0) for key, data in entries[first : first + MAX_PENDING])
+            for result in await asyncio.gather(*writes, return_exceptions=True):
+                if isinstance(result, BaseException) and not isinstance(result, KeyWrongLastSequenceError):
+                    raise result
+    except (TimeoutError, nats.errors.Error) as error:
         raise StreamError(f"the server does not store rows of {bucket}: {error}") from None

@@ -21,23 +21,28 @@ UNKNOWN_PACK = "not in the table of packs; add a row and load it with `bms-estim
 
 
 class PackRegistry:
-    """Registry of rows and cell files, which returns settings and model of a pack."""
+    """Registry of rows and cell files, which returns settings and model of a pack.
+
+    Attributes:
+        rows: Row of each pack.
+        cell_files: Each cell file by its name.
+    """
 
     def __init__(self) -> None:
-        self._rows = dict[str, bytes]()
+        self.rows = dict[str, bytes]()
         self._shared_rows = dict[bytes, bytes]()  # one object for all packs with equal rows
-        self._cell_files = dict[str, str]()
+        self.cell_files = dict[str, bytes]()
         self._parse = lru_cache(MAX_CACHED_SPECS)(_parse_row)
         self._model = lru_cache(MAX_CACHED_SPECS)(_make_model)
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.rows)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._rows)
+        return iter(self.rows)
 
     def __contains__(self, pack: object) -> bool:
-        return pack in self._rows
+        return pack in self.rows
 
     def __call__(self, pack: str) -> tuple[Settings, PackModel] | None:
         """Return settings and model; None if the pack is unknown. Packs with equal rows share these objects."""
@@ -49,7 +54,7 @@ class PackRegistry:
         spec = self.parsed_row(pack)
         if not isinstance(spec, PackSpec) or self(pack) is None:
             return None
-        return PackSource(self._rows[pack].decode(), self.cell_file(spec.cell))
+        return PackSource(self.rows[pack].decode(), self.cell_file(spec.cell))
 
     def resolve(self, source: PackSource) -> tuple[Settings, PackModel] | None:
         """Return settings and model of a row and a cell file; None if they have an error."""
@@ -64,38 +69,38 @@ class PackRegistry:
 
     def parsed_row(self, pack: str) -> PackSpec | str | None:
         """Return a pack's specification, or the error in its row; None without a row."""
-        data = self._rows.get(pack)
+        data = self.rows.get(pack)
         return None if data is None else self._parse(data)
 
     def cell_file(self, name: str) -> str | None:
         """Return the text of a cell file; None if it is missing or not used, because a shipped cell has this name."""
-        return None if name in known_cells() else self._cell_files.get(name)
+        file = None if name in known_cells() else self.cell_files.get(name)
+        return None if file is None else file.decode(errors="replace")
 
     def set_row(self, pack: str, data: bytes | None) -> bool:
         """Set or remove (None) a pack's row. Return True if the row has changed."""
-        if data == self._rows.get(pack):
+        if data == self.rows.get(pack):
             return False
         if data is None:
-            del self._rows[pack]
+            del self.rows[pack]
         else:
-            self._rows[pack] = self._shared_rows.setdefault(data, data)
+            self.rows[pack] = self._shared_rows.setdefault(data, data)
         return True
 
     def set_cell(self, name: str, file: bytes | None) -> bool:
         """Set or remove (None) a cell file. Return True if the file has changed."""
-        text = None if file is None else file.decode(errors="replace")
-        if text == self._cell_files.get(name):
+        if file == self.cell_files.get(name):
             return False
-        if text is None:
-            del self._cell_files[name]
+        if file is None:
+            del self.cell_files[name]
         else:
-            self._cell_files[name] = text
+            self.cell_files[name] = file
         return True
 
     def packs_using(self, cells: Collection[str]) -> set[str]:
         """Return the packs that use one of ``cells``. The method searches all packs."""
         found = set[str]()
-        for pack, data in self._rows.items() if cells else ():
+        for pack, data in self.rows.items() if cells else ():
             spec = self._parse(data)
             if not isinstance(spec, str) and spec.cell in cells:
                 found.add(pack)
@@ -108,7 +113,7 @@ class PackRegistry:
             return UNKNOWN_PACK
         if isinstance(spec, str):
             return f"its row is wrong: {spec}"
-        return self._model(spec, self._cell_files.get(spec.cell))
+        return self._model(spec, self.cell_file(spec.cell))
 
 
 def _parse_row(data: bytes) -> PackSpec | str:

@@ -154,6 +154,9 @@ class WorkerFit(SlowFit):
         """Handle rows and events of the loaded pack."""
         self._advance_loaded(self)
 
+    def resume(self, gap_s: float, *, restored: bool) -> None:
+        """Leave the history unchanged: it continues on the server, and the next block schedules the next fit."""
+
 
 Advance = Callable[[WorkerFit], None]
 """Function that handles rows and events of the fits of the loaded pack."""

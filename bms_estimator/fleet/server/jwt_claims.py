@@ -70,6 +70,8 @@ _WORKER_PUBLISH = (
     *_READER_PUBLISH,
     "$JS.API.STREAM.PURGE.OBJ_states",
     "$KV.checkpoints.>",
+    "$KV.packs.*",
+    "$KV.cells.*",
     "$O.states.>",
     "edge.*.awaits",
     "bms.>",

@@ -7,17 +7,20 @@ state includes all earlier ones. All other messages need requests to the server,
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Protocol
 
 from bms_estimator.fleet.worker.block_result import ResultPublisher
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
-from bms_estimator.fleet.worker.retry import Attempt
 from bms_estimator.fleet.worker.takeover import ReplayGuard
 
 SLICE_S = 0.004
 """Duration of a slice [s], after which the event loop sends heartbeats and receives messages. The last message of a slice may
 exceed it."""
+
+
+Attempt = Callable[[Callable[[], Awaitable[None]]], Awaitable[bool]]
+"""Function that runs an action, logs an error of the connection or the server, and returns True if the action succeeded."""
 
 
 class BlockQueue(Protocol):

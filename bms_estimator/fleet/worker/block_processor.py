@@ -11,7 +11,6 @@ from bms_estimator.checkpoint.arrays_file import without_observer
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.estimator.restore import restore_state
 from bms_estimator.fleet.fits.messages import FitResult
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType, PackTypes
@@ -36,6 +35,7 @@ from bms_estimator.model.arrays import fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
+from bms_estimator.pack.state import CHECKPOINT, REFUSED, PackState
 from bms_estimator.telemetry.cells import make_cells_payload
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
 from bms_estimator.telemetry.parameters import make_parameters_payload
@@ -143,20 +143,22 @@ class BlockProcessor:
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
             # the observer's state also depends on settings outside ``STATE_DIGEST``; other states do not
             valid = saved if is_same_config else without_observer(saved)
-            gap_s = self._gap_s(block)
-            error = restore_state(pack_type.estimator, valid, gap_s)
-            self._resume_cells(pack_type, gap_s, is_valid=not error)
+            cells = {"cells": self._unpacked.cells, "bank": self._unpacked.bank} if self._unpacked.cell_count else {}
+            state = PackState(record=valid, curves=self._fits.curves_in_force(), cells=cells)
+            pack_type.cells.use_state(NO_CELL_STATES, np.zeros(1, BANK))
+            outcomes = pack_type.pack.restore(state, self._gap_s(block))
+            self._store_cells(pack_type)
             # the restored estimator has no last sample, and its counters begin at 0
             self._charge_energy["sums"]["counted"] = 0
             self._hour["outliers_before"] = self._hour["searches_before"] = 0
-            self._counters["not_taken_over" if error else "taken_over"] += 1
+            self._counters["not_taken_over" if outcomes[CHECKPOINT].startswith(REFUSED) else "taken_over"] += 1
         else:
             for name in ("flow", "hour", "fit", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
             d[LAST_STORE_NS] = d["hour"] = d["clock_error_s"] = 0
             self._unpacked.start_cells(0)
             self._counters["begun_anew"] += has_state
-        self._fits.restart()
+        self._fits.restart(pack_type)
         d[CONFIG_DIGEST], d[STATE_DIGEST] = pack_type.config_digest, pack_type.state_digest
         return True
 
@@ -168,19 +170,12 @@ class BlockProcessor:
         else:
             cells.use_state(NO_CELL_STATES, np.zeros(1, BANK))
 
-    def _resume_cells(self, pack_type: PackType, gap_s: float, *, is_valid: bool) -> None:
-        """Adapt the state of the single cells in the record to other settings of the pack.
-
-        Args:
-            pack_type: Present type of the pack.
-            gap_s: Gap before the next sample [s]; infinite if unknown.
-            is_valid: True if the state of the pack was restored.
-        """
-        if is_valid and self._unpacked.cell_count == pack_type.cells.estimated_cells:
-            self._load_cells(pack_type)
-            pack_type.cells.resume(gap_s)
-        else:
-            self._unpacked.start_cells(0)
+    def _store_cells(self, pack_type: PackType) -> None:
+        """Store the state of the single cells in the record if their number has changed, or they have other arrays."""
+        cells = pack_type.cells
+        self._unpacked.start_cells(cells.cells.size)
+        if cells.cells.size:
+            self._unpacked.cells[...], self._unpacked.bank[...] = cells.cells, cells.bank
 
     def _resume_after_store_change(self, pack_type: PackType, block: Block) -> None:
         """Resume the estimator after a gap if the edge's store is another one than for the last sample.
@@ -218,8 +213,7 @@ class BlockProcessor:
             self._window.add(trace, arrival_s, known_voltages(block.cells_v[part]))
             self._alarms.add(pack_type, samples, block.cells_v[part], trace, wall_offset_s)
         if cells.cells.size != self._unpacked.cell_count:  # the first block with cell voltages
-            self._unpacked.start_cells(cells.cells.size)
-            self._unpacked.cells[...], self._unpacked.bank[...] = cells.cells, cells.bank
+            self._store_cells(pack_type)
         counters["blocks"] += 1
         counters["samples"] += block.samples.size
         counters["dropped_samples"] += block.samples.size - (int(observer["samples"]) - accepted_before)

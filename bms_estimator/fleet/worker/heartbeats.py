@@ -18,7 +18,7 @@ from pathlib import Path
 
 from bms_estimator.edge.block import VERSION as BLOCK_VERSION
 from bms_estimator.fleet.heartbeat import DEAD_S, Heartbeat, RefusedPartition
-from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT, common_format, oldest_format
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, common_format, oldest_format
 from bms_estimator.fleet.worker.lease_tasks import LeaseTotals
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.version import __version__

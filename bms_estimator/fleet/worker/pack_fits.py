@@ -75,9 +75,19 @@ class PackFits:
         if pack_type.pack.slow_fit and not self._h["enabled"]:
             pack_type.estimator.schedule(self._h["elapsed_s"] + pack_type.pack.slow_fit.interval())
 
-    def restart(self) -> None:
-        """Drop a request, because the pack's settings have changed. The next block begins a new interval."""
+    def curves_in_force(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of the fit in force (``PackState.curves``); empty without one."""
+        fit = self._fit["in_force"]
+        return curve_arrays(fit_of_record(fit) if fit["sequence"] else None)
+
+    def restart(self, pack_type: PackType) -> None:
+        """Drop a request, because the pack's settings have changed. The next block begins a new interval.
+
+        Without fits, the curves are those of the cell file.
+        """
         self._fit["request"], self._fit["received"], self._h["enabled"] = 0, np.zeros((), PACK_FIT), 0
+        if pack_type.pack.slow_fit is None:
+            self._fit["in_force"] = np.zeros((), PACK_FIT)
 
     def advance(self, slow_fit: WorkerFit) -> None:
         """Take completed rows, and request or adopt a fit that is due."""

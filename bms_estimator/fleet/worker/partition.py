@@ -29,8 +29,11 @@ from bms_estimator.fleet.worker.block_order import (
 )
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, LETHAL, BlockResult
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
-from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
+    CheckpointError,
+    PartitionCheckpoint,
+    read_checkpoint,
+)
 from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
 from bms_estimator.fleet.worker.pack_records import PackRecords
 from bms_estimator.fleet.worker.pack_state import Fields

@@ -17,17 +17,16 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
-from bms_estimator.fleet.nats.connection import error_text
+from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.worker.block_loop import SILENCE_S, BlockLoop, DeliveredMessages
 from bms_estimator.fleet.worker.block_result import ResultPublisher, merge
 from bms_estimator.fleet.worker.block_runner import BlockRunner
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
-from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.partition_tasks import DeferredReader, TableChangeSender
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer, RawMessages
-from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 from bms_estimator.fleet.worker.takeover import ReplayGuard, restore_partition
 from bms_estimator.process.tasks import until_first_ends

@@ -8,12 +8,13 @@ from nats.aio.client import Client
 from nats.js.errors import NotFoundError
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.connection import RETRY_S
+from bms_estimator.fleet.worker.block_loop import Attempt
 from bms_estimator.fleet.worker.block_result import ResultPublisher
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.pinned_consumer import trusted_data
-from bms_estimator.fleet.worker.retry import RETRY_S, Attempt
 
 
 class DeferredReader:

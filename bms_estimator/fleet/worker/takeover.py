@@ -11,9 +11,9 @@ from contextlib import aclosing
 
 import structlog
 
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, ReplayRecord, ReplayRecords
-from bms_estimator.fleet.worker.checkpoint.format_versions import UnreadableFormatError
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 

@@ -15,17 +15,16 @@ from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
-from bms_estimator.fleet.nats.connection import close, connect, error_text
+from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, close, connect, error_text
 from bms_estimator.fleet.nats.streams import require_partitions
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.block_loop import BlockLoop
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
 from bms_estimator.fleet.worker.heartbeats import HeartbeatReport, Membership
-from bms_estimator.fleet.worker.lease_tasks import LeaseTasks
+from bms_estimator.fleet.worker.lease_tasks import LeaseTasks, PeriodicStorage, UnknownPacks, UnsavedCheck
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
-from bms_estimator.fleet.worker.periodic_tasks import PeriodicStorage, UnknownPacks, UnsavedCheck, check_refused
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
-from bms_estimator.fleet.worker.retry import RETRY_S, RETRYABLE_ERRORS
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import end, until_first_ends
@@ -275,10 +274,18 @@ class Worker:
             await self._send_heartbeat()
 
     async def _check_refused(self) -> None:
-        """Accept the refused partitions whose checkpoints have become readable."""
-        if self._nc.is_connected:
-            numbers = self._members.refused.keys() - self._lease_tasks.numbers
-            await check_refused(numbers, self._members, self._checkpoints)
+        """Accept the refused partitions whose checkpoints another worker has written in a readable format since."""
+        refused = self._members.refused
+        for number in refused.keys() - self._lease_tasks.numbers if self._nc.is_connected else ():
+            try:
+                await self._checkpoints.claims.check_format(number)
+            except UnreadableFormatError as error:
+                refused[number] = error.found
+            except RETRYABLE_ERRORS as error:
+                log.warning("a refused partition cannot be checked", partition=number, reason=error_text(error))
+            else:
+                log.info("the checkpoint of a refused partition has become readable", partition=number)
+                del refused[number]
 
     async def _send_requests(self) -> None:
         if self._nc.is_connected:

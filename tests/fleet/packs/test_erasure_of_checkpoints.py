@@ -10,10 +10,9 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.table_change import PackSource, encode_change
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim
-from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
 from tests.command_line import run
 from tests.fleet.checkpoints import DAY_S, damage, raw, stored_objects
 from tests.fleet.nats_cluster import NatsCluster

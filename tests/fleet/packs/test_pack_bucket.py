@@ -12,6 +12,7 @@ from bms_estimator.fleet.packs.pack_bucket import (
     PackBucket,
     WriteCounts,
     purge_keys,
+    put_new,
     read_bucket,
     remove_keys,
     write_bucket,
@@ -20,6 +21,7 @@ from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.pack_model import cell_text
 from tests.fleet.nats_cluster import connected, running
+from tests.fleet.workers import until_table
 from tests.patience import LONG_S
 
 LFP_ROW = encode_row(PackSpec(cell="lfp", capacity_ah=100.0, series=16))
@@ -93,9 +95,22 @@ async def test_refresh_after_the_table_was_recreated_returns_the_changed_packs(n
         "f": LFP_ROW,
     }  # of which three have numbers that were read before
     await write_bucket(nc, PACKS_BUCKET, rows)
-    assert await bucket.refresh() == {"a", *rows}
+    await remove_keys(nc, PACKS_BUCKET, ["c"])
+    assert await bucket.refresh() == {"a", "c", *rows}
     assert bucket.packs("a")
     assert bucket.packs("b") is None
+    follower = asyncio.create_task(bucket.follow(lambda _: None))
+    try:  # only the lost row is written again, and neither the changed nor the removed one
+        await until_table(nc, {"a": encode_row(PackSpec(cell="own")), **rows})
+    finally:
+        follower.cancel()
+
+
+async def test_new_keys_do_not_replace_values(nc):
+    await write_bucket(nc, PACKS_BUCKET, {"a": LFP_ROW, "b": LFP_ROW})
+    await remove_keys(nc, PACKS_BUCKET, ["b"])
+    await put_new(nc, PACKS_BUCKET, dict.fromkeys(("a", "b", "new"), b"{}"))
+    assert await read_bucket(nc, PACKS_BUCKET) == {"a": LFP_ROW, "new": b"{}"}
 
 
 async def test_refresh_finds_that_a_row_was_purged_with_the_mark_of_its_removal(nc):

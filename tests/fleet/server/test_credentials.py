@@ -25,6 +25,7 @@ from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.dead_packs import DeadPackReader
 from bms_estimator.fleet.nats.streams import consumer, make_streams
+from bms_estimator.fleet.packs.pack_bucket import put_new
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_config import Accounts, configuration
@@ -255,9 +256,11 @@ async def test_worker_can_do_its_work_and_nothing_else(fleet: Fleet) -> None:
         assert (await inbox.next_msg(LONG_S)).subject.startswith("p.")
         packs = await (await js.key_value(subjects.PACKS_BUCKET)).watchall()
         assert await packs.updates(LONG_S) is None
+        await put_new(nc, subjects.PACKS_BUCKET, {"lost": b"{}"})
+        await put_new(nc, subjects.CELLS_BUCKET, {"lost": b""})
         assert rejections == []
-        streams = ("$JS.API.STREAM.DELETE.RAW", "$JS.API.STREAM.PURGE.RAW")
-        await assert_rejected(nc, rejections, "raw.p1", "p.1.raw.p1", "$KV.packs.p1", *streams)
+        streams = ("$JS.API.STREAM.DELETE.RAW", "$JS.API.STREAM.PURGE.RAW", "$JS.API.STREAM.PURGE.KV_packs")
+        await assert_rejected(nc, rejections, "raw.p1", "p.1.raw.p1", *streams)
 
 
 def test_real_worker_needs_no_further_permissions(

@@ -6,8 +6,8 @@ The first argument is the newest format of this version. The migrations count th
 import sys
 from collections.abc import Callable
 
-from bms_estimator.fleet.worker.checkpoint import format_versions
-from bms_estimator.fleet.worker.checkpoint.format_versions import Header, HeaderMigration
+from bms_estimator.fleet.worker.checkpoint import checkpoint_format
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import Header, HeaderMigration
 
 UPGRADED, DOWNGRADED = "upgraded", "downgraded"
 """Names of the counters of converted checkpoints."""
@@ -24,8 +24,8 @@ def set_format(newest: int, set_attribute: Callable[[object, str, object], None]
     migration = HeaderMigration(
         upgrade=lambda header: count(header, UPGRADED), downgrade=lambda header: count(header, DOWNGRADED)
     )
-    set_attribute(format_versions, "FORMAT", newest)
-    set_attribute(format_versions, "PREVIOUS", migration)
+    set_attribute(checkpoint_format, "FORMAT", newest)
+    set_attribute(checkpoint_format, "PREVIOUS", migration)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Disk of the server that is lost while a worker lives: the worker keeps its states and saves them on the new disk."""
+"""Disk of the server that is lost while a worker lives: the worker saves its states and the table of packs on the new disk."""
 
 import asyncio
 import contextlib
@@ -13,14 +13,24 @@ from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
 from bms_estimator.fleet.nats.streams import make_streams
 from tests.fleet.nats_cluster import connected, running
 from tests.fleet.partition_stream import estimates_of
-from tests.fleet.workers import Heartbeats, Process, block, end_states, estimated, load_packs, send
+from tests.fleet.workers import (
+    PACK_ROW,
+    Heartbeats,
+    Process,
+    block,
+    end_states,
+    estimated,
+    load_packs,
+    send,
+    until_table,
+)
 from tests.patience import LONG_S
 
 BLOCKS = 4
 """Number of blocks before the loss, and after it."""
 
 
-async def test_worker_fills_the_empty_bucket_of_a_new_disk_with_its_states(tmp_path: Path) -> None:
+async def test_worker_fills_the_buckets_of_a_new_disk_with_its_states_and_the_table_of_packs(tmp_path: Path) -> None:
     with running(tmp_path, partitions=1) as cluster:
         nc = await connected(cluster.url)
         await make_streams(nc, partitions=1)
@@ -37,6 +47,7 @@ async def test_worker_fills_the_empty_bucket_of_a_new_disk_with_its_states(tmp_p
                 cluster.start(0)
                 await make_streams(nc, partitions=1)
                 await _until_saved(nc)
+                await until_table(nc, {"p1": PACK_ROW})
                 for number in range(BLOCKS + 1, 2 * BLOCKS + 1):
                     await send(nc, "p1", block("p1", number))
                 await heartbeats.until(lambda last: last["w1"].counters.get("blocks") == 2 * BLOCKS)

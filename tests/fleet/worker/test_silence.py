@@ -11,8 +11,8 @@ from structlog.testing import capture_logs
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.block_loop import BlockLoop
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
-from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.table_in_force import PackLookup

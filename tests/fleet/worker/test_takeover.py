@@ -2,8 +2,8 @@
 
 import pytest
 
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
-from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
 from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
 from tests.fleet.checkpoints import raw
 

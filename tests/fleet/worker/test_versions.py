@@ -14,7 +14,7 @@ from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
-from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.partition import Partition
 from tests.command_line import PROGRAM, running_program
 from tests.fleet.nats_cluster import NatsCluster

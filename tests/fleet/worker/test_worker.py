@@ -20,6 +20,7 @@ from nats.aio.client import Client
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS
 from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.csv_table import read_table
@@ -30,7 +31,6 @@ from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker.heartbeats import assign_partitions
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.fleet.worker.retry import RETRYABLE_ERRORS
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.workers import Fitter, Heartbeats, Process, end_states

@@ -21,10 +21,9 @@ from nats.js.object_store import ObjectStore
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer
 from bms_estimator.fleet.nats.stream_sizes import DAILY_CHECKPOINTS
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import INCREMENT_FORMAT, PartitionCheckpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import CheckpointObjects
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, Claims, FencedError, ReplayRecords
-from bms_estimator.fleet.worker.checkpoint.format_versions import INCREMENT_FORMAT
 
 MAX_INCREMENTS = 32
 """Maximum number of increments of a checkpoint, which limits the number of objects."""

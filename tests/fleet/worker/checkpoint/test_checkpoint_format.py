@@ -12,13 +12,15 @@ from hypothesis import strategies as st
 from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.fleet.worker import pack_records
 from bms_estimator.fleet.worker.block_order import MAX_EARLY_REPEATS
-from bms_estimator.fleet.worker.checkpoint import format_versions
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CHUNK_BYTES, PartitionCheckpoint, read_checkpoint
-from bms_estimator.fleet.worker.checkpoint.format_versions import (
+from bms_estimator.fleet.worker.checkpoint import checkpoint_format
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
+    CHUNK_BYTES,
     FORMAT,
     CheckpointError,
+    PartitionCheckpoint,
     UnreadableFormatError,
     common_format,
+    read_checkpoint,
 )
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.pack_records import (
@@ -130,8 +132,8 @@ def test_checkpoint_of_another_partition_is_rejected() -> None:
 def later_format(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Set the next format as the newest one, which the migrations of ``later_version`` convert."""
     with monkeypatch.context() as patched:
-        later_version.set_format(format_versions.FORMAT + 1, patched.setattr)
-        yield format_versions.FORMAT
+        later_version.set_format(checkpoint_format.FORMAT + 1, patched.setattr)
+        yield checkpoint_format.FORMAT
 
 
 def test_previous_format_is_upgraded_when_it_is_read_and_downgraded_when_it_is_written(later_format: int) -> None:
@@ -143,7 +145,7 @@ def test_previous_format_is_upgraded_when_it_is_read_and_downgraded_when_it_is_w
 
 def test_error_of_an_unreadable_format_names_both_formats_and_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
-        later_version.set_format(format_versions.FORMAT + 2, patched.setattr)
+        later_version.set_format(checkpoint_format.FORMAT + 2, patched.setattr)
         later = to_bytes(PartitionCheckpoint(3, 0))
     with pytest.raises(UnreadableFormatError, match=r"is of format 5, this version reads 2 and 3: start a worker"):
         read_checkpoint(later)

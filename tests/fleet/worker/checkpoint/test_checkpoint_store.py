@@ -15,11 +15,15 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import RefusedPartition
 from bms_estimator.fleet.nats.stream_sizes import DAILY_CHECKPOINTS
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
+    FORMAT,
+    PartitionCheckpoint,
+    UnreadableFormatError,
+    readable_text,
+)
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import MESSAGE_BYTES
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CHECKPOINTS_PER_PARTITION, open_checkpoints
 from bms_estimator.fleet.worker.checkpoint.claims import FencedError
-from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT, UnreadableFormatError, readable_text
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.fleet.checkpoints import STATES_STREAM, Clock, chunk_subject, load, raw
 from tests.fleet.nats_cluster import NatsCluster, running

@@ -11,7 +11,7 @@ from nats.aio.client import Client
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
-from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.command_line import run
 from tests.fleet.checkpoints import DAY_S, Clock, damage, raw

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from nats.aio.client import Client
 
 from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
     MAX_INCREMENT_FRACTION,
@@ -19,7 +19,6 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_store import (
     CheckpointStore,
     open_checkpoints,
 )
-from bms_estimator.fleet.worker.checkpoint.format_versions import FORMAT
 from bms_estimator.fleet.worker.partition import Partition
 from tests.estimator.simulated_cell import pulses
 from tests.fleet.checkpoints import DAY_S, Clock, damage, load, stored_objects

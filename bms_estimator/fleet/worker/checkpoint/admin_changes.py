@@ -1,35 +1,150 @@
-"""Erasure of packs from the server: blocks, dead letters, states in checkpoints and in the memory of workers, hourly rows.
+"""Changes of checkpoints by an administrator: return of partitions to an earlier day, and erasure of packs from the server.
 
-The other packs of a partition lose nothing, because their blocks since the rewritten checkpoint are in the stream.
+Each change claims the partition as a worker does. The owner is thereby fenced out, drops the partition from its memory, and takes it
+over again from the changed checkpoints. An erasure covers blocks, dead letters, states in checkpoints and in the memory of workers,
+and hourly rows. The other packs of a partition lose nothing, because their blocks since the rewritten checkpoint are in the stream.
 """
 
 import asyncio
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Awaitable, Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
+from datetime import UTC, date, datetime
+from functools import partial
 from typing import Any, TypeVar
 
+import nats.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
+from bms_estimator.fleet.nats.connection import RETRY_S
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.fleet.nats.streams import RESPONSE_TIMEOUT_S, require_partitions
+from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, require_partitions
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, purge_keys, read_bucket, remove_keys
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import PartitionCheckpoint, read_checkpoint
+from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
+    CheckpointError,
+    PartitionCheckpoint,
+    UnreadableFormatError,
+    read_checkpoint,
+)
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
-from bms_estimator.fleet.worker.checkpoint.claims import change_checkpoints
-from bms_estimator.fleet.worker.checkpoint.format_versions import CheckpointError, UnreadableFormatError
+from bms_estimator.fleet.worker.checkpoint.claims import FencedError
 from bms_estimator.model.errors import UserError
 
-WORKER_NAME = "packs-remove"
-"""Name with which the erasure claims a partition."""
+RESTORE_NAME, ERASE_NAME = "checkpoints-restore", "packs-remove"
+"""Names with which the commands claim partitions."""
+MAX_CLAIMS = 20
+"""Maximum number of claims of a partition, because its worker may claim it again before its checkpoints are changed."""
 TABLE_S = 3.0 * POLL_S
 """Waiting time until all workers have removed a pack from their copies of the table [s]."""
 MAX_TOKENS = 5
 """Maximum position of a pack's name in a subject [tokens]."""
 V = TypeVar("V")
+
+
+async def change_checkpoints(nc: Client, partition: int, change: Callable[[], Awaitable[None]]) -> None:
+    """Change the checkpoints of a partition, and let its worker take it over again.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+        partition: Number of the partition.
+        change: Claims the partition and changes its checkpoints. It is repeated if a worker claims the partition meanwhile.
+
+    Raises:
+        UserError: A worker claims the partition at each attempt.
+    """
+    for _ in range(MAX_CLAIMS):
+        try:
+            await change()
+            break
+        except FencedError:
+            await asyncio.sleep(RETRY_S)
+    else:
+        raise UserError(
+            f"partition {partition}: its worker claims it at each attempt; end the workers and repeat the command"
+        )
+    # a worker whose pin ends checks its claim, finds it replaced, and drops the partition from its memory
+    request = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
+    with suppress(nats.errors.TimeoutError):
+        await nc.request(request, json.dumps({"group": GROUP}).encode(), timeout=RESPONSE_TIMEOUT_S)
+
+
+def day_of(info: CheckpointInfo) -> date:
+    """Return the UTC day on which a checkpoint was written."""
+    return datetime.fromtimestamp(info.made_s, UTC).date()
+
+
+async def read_pointers(nc: Client) -> dict[int, Pointer]:
+    """Return the pointers to the checkpoints, by partition.
+
+    Raises:
+        UserError: The server has no streams.
+    """
+    partitions = await require_partitions(nc)
+    entries = await read_bucket(nc, subjects.CHECKPOINTS_BUCKET)
+    keys = {number: pointer_key(number) for number in range(partitions)}
+    return {number: Pointer.model_validate_json(entries[key]) for number, key in keys.items() if key in entries}
+
+
+async def restore_day(
+    nc: Client, day: date, partitions: Collection[int], *, skip_blocks: bool
+) -> Mapping[int, CheckpointInfo]:
+    """Make the daily checkpoint of a day the last checkpoint of each partition.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+        day: UTC day.
+        partitions: Numbers of the partitions; empty: all.
+        skip_blocks: Skip all blocks that are in the stream now. Otherwise the workers process those after the checkpoint again.
+
+    Returns:
+        The daily checkpoints, by partition. Partitions without a checkpoint of the day remain unchanged, and are left out.
+
+    Raises:
+        UserError: No partition has a checkpoint of the day, or one is damaged or of a version that this one cannot read.
+    """
+    pointers = await read_pointers(nc)
+    chosen = {
+        number: info
+        for number, pointer in pointers.items()
+        for info in pointer.daily
+        if day_of(info) == day and (not partitions or number in partitions)
+    }
+    if not chosen:
+        days = sorted({day_of(info) for pointer in pointers.values() for info in pointer.daily})
+        raise UserError(f"{day}: no checkpoint of this day; there are those of {', '.join(map(str, days)) or 'no day'}")
+    store = await open_checkpoints(nc, RESTORE_NAME)
+    last = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq if skip_blocks else None
+    for number, info in chosen.items():
+        await change_checkpoints(nc, number, partial(_restore, store, number, info, last))
+    return chosen
+
+
+async def _restore(store: CheckpointStore, number: int, info: CheckpointInfo, last_sequence: int | None) -> None:
+    """Make a daily checkpoint the last checkpoint of a partition.
+
+    Args:
+        store: Checkpoints.
+        number: Number of the partition.
+        info: Daily checkpoint.
+        last_sequence: Stream sequence number of the last skipped message; None: no message is skipped.
+
+    Raises:
+        UserError: The checkpoint cannot be read.
+        FencedError: A worker has claimed the partition meanwhile.
+    """
+    try:
+        claim = await store.claim(number)
+        checkpoint = read_checkpoint(await store.read(info))
+    except CheckpointError as error:
+        raise UserError(f"partition {number}: {error}") from None
+    if last_sequence is not None:
+        checkpoint = replace(checkpoint, sequence=last_sequence, deferred={})
+    # all live workers read the format of the last checkpoint
+    await store.replace_last(claim, checkpoint, file_format=claim.pointer.kept[0].format)
 
 
 @dataclass(frozen=True)
@@ -64,7 +179,7 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
         StreamError: The server rejects a request.
     """
     partitions = await require_partitions(nc)
-    store = await open_checkpoints(nc, WORKER_NAME)
+    store = await open_checkpoints(nc, ERASE_NAME)
     numbers = {subjects.partition_of(pack, partitions) for pack in packs}
     for number in numbers:
         await _check_readable(store, number)
