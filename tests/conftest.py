@@ -107,7 +107,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 def shared_data() -> Path:
     """Return the folder of the real captures, or skip with the searched path."""
     if not SHARED_DATA.is_dir():
-        pytest.skip(f"real captures are absent: {SHARED_DATA} does not exist (docs/contributing/data.md)")
+        pytest.skip(f"real captures are absent: {SHARED_DATA} does not exist (docs/contributing/tests.md)")
     return SHARED_DATA
 
 

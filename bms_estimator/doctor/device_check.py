@@ -9,20 +9,22 @@ import math
 import os
 import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from bms_estimator.doctor.finding import Finding, fault, ok, warning
 from bms_estimator.doctor.subject import Subject
 from bms_estimator.installation.root_command import root_command
+from bms_estimator.model.cell_slots import is_live
 from bms_estimator.protocols.registry import make_protocol
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_source
 from bms_estimator.sources.serial.known_board_file import STORED_FIELDS, KnownBoardFile
 from bms_estimator.sources.serial.port_list import NoPortError, holder, resolve_port
-from bms_estimator.sources.serial.serial_source import SerialSource
 
 NAME = "device"
 FIRST_SAMPLE_S = 8.0
 """Time within which a device must send a sample [s]. Opening the port may reset a board, whose boot loader takes 2 s."""
+CELLS_S = 2.0
+"""Time after the first sample within which a device sends all cell voltages [s]. Some report them in several responses."""
 PSEUDO_TERMINALS = "/dev/pts/"
 """Folder of pseudo-terminals, on which simulated devices are."""
 UNCALIBRATED_BANDGAP_V = "1.1"
@@ -41,12 +43,14 @@ class NoSampleError(Exception):
 
 @dataclass(frozen=True)
 class FirstSample:
-    """First sample of a device."""
+    """First sample of a device, with the cells of the next samples."""
 
     voltage_v: float
     current_a: float
     board: Mapping[str, str]
     """Properties that the device reported; empty without any."""
+    cells: int
+    """Number of cell voltages; 0 without any."""
 
     def __str__(self) -> str:
         """Describe the sample and the device."""
@@ -83,6 +87,10 @@ def check_device(subject: Subject) -> Iterator[Finding]:
         yield fault(NAME, str(error), SERIAL_REMEDY if source is None else SOURCE_REMEDY)
         return
     yield ok(NAME, f"{name}: {sample}")
+    series = subject.model.cell.series_count
+    if sample.cells != series and (sample.cells or subject.settings.bms):
+        text = f"{sample.cells} cells are measured, but the pack has {series} in series"
+        yield warning(NAME, text, "correct pack.series, or measure the other cells")
     if sample.board.get("bandgap_v"):
         yield from check_board(subject, sample.board)
 
@@ -105,14 +113,23 @@ async def _first_sample(subject: Subject) -> FirstSample:
     Raises:
         NoSampleError: No sample arrives. The message is the reason.
     """
-    source = open_line_source(subject.settings) or SerialSource(subject.settings.sensor)
+    source = open_source(subject.settings)
+    series, sample = subject.model.cell.series_count, None
     async with source:
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(FIRST_SAMPLE_S):
+            async with asyncio.timeout(FIRST_SAMPLE_S) as limit:
                 async for received in source:
                     last = received.samples[-1]
-                    return FirstSample(float(last["voltage_v"]), float(last["current_a"]), dict(source.board))
-        raise NoSampleError(source.silence_reason or f"no sample within {FIRST_SAMPLE_S:g} s")
+                    cells = max(is_live(received.cells_v).sum(axis=1), default=0)
+                    if sample is None:
+                        sample = FirstSample(float(last["voltage_v"]), float(last["current_a"]), dict(source.board), 0)
+                        limit.reschedule(asyncio.get_running_loop().time() + CELLS_S)
+                    sample = replace(sample, cells=max(sample.cells, int(cells)))
+                    if sample.cells == series or sample.board.get("bandgap_v"):
+                        break
+        if sample is None:
+            raise NoSampleError(source.silence_reason or f"no sample within {FIRST_SAMPLE_S:g} s")
+        return sample
 
 
 def check_board(subject: Subject, board: Mapping[str, str]) -> Iterator[Finding]:

@@ -58,7 +58,9 @@ def check_settings(settings: Settings, cell: PackModel) -> list[str]:
         unreadable, unchecked = _unreadable("influx", settings.influx, "password_file", "token_file")
         warnings += unchecked
         target(settings.influx.model_copy(update=dict.fromkeys(unreadable)))  # raises UserError for invalid credentials
-    make_line_producer(settings)  # raises an error if [source] is invalid or its optional package is missing
+    for device in (settings, settings.bms_only):
+        if device is not None:
+            make_line_producer(device)  # raises an error if [source] is invalid or its optional package is missing
     return warnings
 
 
@@ -69,12 +71,19 @@ def summarize(settings: Settings, cell: PackModel) -> str:
     if settings.edge:
         url = settings.edge.url
         broker += f"; samples to {url if isinstance(url, str) else ', '.join(url)}"
-    sensor = settings.sensor
-    device = f"{sensor.protocol} board" if sensor.protocol in ("binary", "text") else sensor.protocol
+    devices = " and ".join(map(_device_text, filter(None, (settings, settings.bms_only))))
     return (
         f"{settings.pack.name}: {ratings.name}, {ratings.series_count} in series, {ratings.nominal_voltage_v:g} V, {cell.capacity_text}; "
-        f"{settings.source.short_description if settings.source else f'{device} on {sensor.port}'}; {broker}"
+        f"{devices}; {broker}"
     )
+
+
+def _device_text(settings: Settings) -> str:
+    """Return the device of ``[sensor]`` or ``[source]`` in a few words."""
+    if settings.source is not None:
+        return settings.source.short_description
+    sensor = settings.sensor
+    return f"{sensor.protocol}{' board' if sensor.protocol in ('binary', 'text') else ''} on {sensor.port}"
 
 
 def _without_credentials(section: str, settings: BrokerSettings) -> tuple[BrokerSettings, list[str]]:

@@ -8,7 +8,6 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import structlog
 from structlog.contextvars import bind_contextvars
@@ -40,17 +39,13 @@ from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.sinks.mqtt.venus_os import configured_limits
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.captures.recorder import CaptureRecorder
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_device, with_bms
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import ReadTap
 from bms_estimator.store.database import Database
 from bms_estimator.store.history import HistorySink
 from bms_estimator.store.outbox import Outbox
-
-if TYPE_CHECKING:
-    from bms_estimator.sources.line_source import LineSource
-
 
 log = structlog.get_logger(__name__)
 
@@ -97,10 +92,9 @@ async def run_pack_service(
         all_sinks.append(HistorySink(database, days=settings.store.history_days))
     requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
     memory = KnownBoardFile(folder, settings.pack.name) if folder else None
-    board: SerialSource | None = None
-    source: LineSource | SerialSource | None = open_line_source(settings, tap=tap)
-    if source is None:
-        source = board = SerialSource(settings.sensor, tap=tap, board_file=memory)
+    device = open_device(settings, tap=tap, board_file=memory)
+    board = device if isinstance(device, SerialSource) else None
+    source = with_bms(device, settings)
     outbox = Outbox(database, max_messages=settings.store.outbox_messages)
     edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     mqtt: MqttSink | None = None
@@ -142,7 +136,7 @@ async def run_pack_service(
         await stack.enter_async_context(outbox)
         if edge:
             await stack.enter_async_context(edge)
-        return await run_estimation_loop(
+        estimator = await run_estimation_loop(
             settings,
             cell,
             source=source,
@@ -150,15 +144,17 @@ async def run_pack_service(
             stop=stop,
             files=StateFiles(folder, settings, cell) if folder else None,
             parts=ServiceParts(
-                ServiceStatus(delivery, source.health, partial(recording_health, tap)),
+                ServiceStatus(delivery, device.health, partial(recording_health, tap)),
                 requests,
-                source.current_zero,
+                device.current_zero,
                 board.board_check if board else None,
                 notifier,
                 hooks,
                 edge,
             ),
         )
+    log.info("stopped", pack=settings.pack.name, state="saved" if folder else "not saved")
+    return estimator
 
 
 def export_sinks(settings: Settings) -> list[Sink]:
@@ -196,7 +192,8 @@ async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None
     """
     names = [settings.pack.name for settings, _ in packs]
     _require_unique("pack.name", names)
-    sensors = [settings.sensor for settings, _ in packs if settings.source is None]
+    devices = [each for settings, _ in packs for each in (settings, settings.bms_only) if each is not None]
+    sensors = [device.sensor for device in devices if device.source is None]
     _require_unique("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
     # several packs may share the port "auto" if each has the serial number of its board
     _require_unique("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])

@@ -20,6 +20,8 @@ class AlarmKind(NamedTuple):
     """Quantities without which the alarm cannot be evaluated; empty for alarms about the samples themselves."""
     unit: str | None = None
     """Unit of value and limit; None for a number without unit."""
+    is_fraction: bool = False
+    """True if value and limit are 0..1, which texts show in %."""
     is_upper_limit: bool = True
     """True if the alarm is raised at or above its limit, False if at or below."""
     device_class: str = "problem"
@@ -64,6 +66,7 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
         "little charge is left (SOC minus its standard deviation)",
         "charge",
         ("voltage", "current"),
+        is_fraction=True,
         is_upper_limit=False,
         device_class="battery",
     ),
@@ -71,6 +74,7 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
         "the voltage may reach the cut-off within 5 min (probability)",
         "reduce the load, and charge",
         ("voltage", "current"),
+        is_fraction=True,
     ),
     "stability_margin_low": AlarmKind(
         "the SOC is close to the value below which the thesis's model is not valid",

@@ -19,7 +19,7 @@ FALSE_ALARMS = (
     (39.1, 0.05),
 )
 """Pairs of the number of false alarms in 100 h of use and the limit: points of the measured curve of all discharges
-(docs/theory/collapse.md)."""
+(docs/theory/forecast.md)."""
 
 
 def collapse_limit(false_alarms_per_month: float) -> float:

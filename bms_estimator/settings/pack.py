@@ -111,6 +111,55 @@ class PackSettings(PackValues, _PackNames):
     )
 
 
+def _with_source_defaults(tables: object) -> object:
+    """Return tables with the ``[sensor]`` defaults of their ``[source]``. The protocol is text, because sources produce text lines.
+
+    Raises:
+        ValueError: ``[sensor]`` describes a serial device.
+    """
+    if not isinstance(tables, dict) or tables.get("source") is None:
+        return tables
+    sensor = tables.get("sensor", {})
+    configured = sensor.model_dump(exclude_unset=True) if isinstance(sensor, SensorSettings) else sensor
+    try:
+        source = _SOURCE_ADAPTER.validate_python(tables["source"])
+    except ValidationError:  # the validation of the section reports it
+        return tables
+    if not isinstance(configured, dict):
+        return tables
+    conflicts = [
+        name for name, allowed in ALLOWED_WITH_SOURCE.items() if configured.get(name, allowed[0]) not in allowed
+    ]
+    if conflicts:
+        names = ", ".join(f"sensor.{name}" for name in conflicts)
+        raise ValueError(
+            f"{names}: only for a serial device, but [source] describes another source; remove one of them"
+        )
+    return tables | {
+        "sensor": {"period_s": source.period_s, **source.sensor_defaults, **configured, "protocol": "text"}
+    }
+
+
+class BmsSettings(Strict):
+    """BMS that measures cells and temperatures, while [sensor] or [source] is a battery monitor that measures voltage and current."""
+
+    sensor: SensorSettings = Field(
+        default=SensorSettings(),
+        description="BMS on a serial port, with the keys of [sensor]",
+        examples=['sensor = { port = "/dev/ttyUSB1", protocol = "jk" }'],
+    )
+    source: SourceSettings | None = Field(
+        default=None,
+        description="BMS that is not on a serial port, with the keys of [source]",
+        examples=['source = { kind = "mqtt", profile = "esphome-jk", prefix = "jk-bms" }'],
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _add_source_defaults(cls, tables: object) -> object:
+        return _with_source_defaults(tables)
+
+
 class PublishSettings(Strict):
     """Rate of the published estimates."""
 
@@ -159,6 +208,7 @@ class Settings(Strict):
     source: SourceSettings | None = Field(
         default=None, description="omit this section if [sensor] describes the source"
     )
+    bms: BmsSettings | None = Field(default=None, description="omit this section if one device measures everything")
     observer: ObserverSettings = ObserverSettings()
     identifier: IdentifierSettings = IdentifierSettings()
     publish: PublishSettings = PublishSettings()
@@ -181,7 +231,7 @@ class Settings(Strict):
         """Select the adaptation law ``learning`` by default if the identifier is off.
 
         The default law of the thesis moves the parameters between bounds without identifying them
-        (docs/theory/comparison.md).
+        (docs/theory/thesis.md).
         """
         if not isinstance(tables, dict):
             return tables
@@ -193,32 +243,7 @@ class Settings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _add_source_defaults(cls, tables: object) -> object:
-        """Add the ``[sensor]`` defaults of a ``[source]``. The protocol is text, because sources produce text lines.
-
-        Raises:
-            ValueError: ``[sensor]`` describes a serial device.
-        """
-        if not isinstance(tables, dict) or tables.get("source") is None:
-            return tables
-        sensor = tables.get("sensor", {})
-        configured = sensor.model_dump(exclude_unset=True) if isinstance(sensor, SensorSettings) else sensor
-        try:
-            source = _SOURCE_ADAPTER.validate_python(tables["source"])
-        except ValidationError:  # the validation of the section reports it
-            return tables
-        if not isinstance(configured, dict):
-            return tables
-        conflicts = [
-            name for name, allowed in ALLOWED_WITH_SOURCE.items() if configured.get(name, allowed[0]) not in allowed
-        ]
-        if conflicts:
-            names = ", ".join(f"sensor.{name}" for name in conflicts)
-            raise ValueError(
-                f"{names}: only for a serial device, but [source] describes another source; remove one of them"
-            )
-        return tables | {
-            "sensor": {"period_s": source.period_s, **source.sensor_defaults, **configured, "protocol": "text"}
-        }
+        return _with_source_defaults(tables)
 
     @model_validator(mode="before")
     @classmethod
@@ -233,6 +258,13 @@ class Settings(Strict):
         if isinstance(parallel, int) and isinstance(protocol, str) and 1 < parallel <= max_batteries(protocol):
             return tables | {"sensor": {"batteries": parallel} | sensor}
         return tables
+
+    @property
+    def bms_only(self) -> Self | None:
+        """Settings with the device in ``[bms]`` as the only one; None without it."""
+        if self.bms is None:
+            return None
+        return self.model_copy(update={"sensor": self.bms.sensor, "source": self.bms.source, "bms": None})
 
     @property
     def charge_limits(self) -> ChargeLimits:

@@ -41,6 +41,10 @@ class Answers:
     """Capacity of one cell [Ah]."""
     series: int | None = None
     parallel: int | None = None
+    full_voltage_v: float | None = None
+    """Voltage of the pack at which its charger stops [V]; None: that of the cell file applies."""
+    cutoff_voltage_v: float | None = None
+    """Voltage of the pack at which its BMS ends a discharge [V]; None: that of the cell file applies."""
     max_discharge_a: float | None = None
     """Largest discharge current of the pack [A]; None: no limit is configured."""
     max_charge_a: float | None = None
@@ -81,15 +85,10 @@ class Answers:
 
     def _tables(self, brokers: GivenSettings) -> GivenSettings:
         pack = {key: getattr(self, key) for key in ("name", "cell", "capacity_ah", "series", "parallel")}
-        limits = {"max_discharge_a": self.max_discharge_a, "max_charge_a": self.max_charge_a}
-        optional = limits | {"device_soc_std": self.device_soc_std}
-        pack |= {key: value for key, value in optional.items() if value is not None}
-        tables: dict[str, dict[str, object]] = {"pack": pack}
-        for section, values in self.device.tables.items():
-            tables[section] = dict(values)
+        optional = ("full_voltage_v", "cutoff_voltage_v", "max_discharge_a", "max_charge_a", "device_soc_std")
+        pack |= {key: value for key in optional if (value := getattr(self, key)) is not None}
+        tables = {"pack": pack, **self.device.tables_with(brokers.get("source", {}))}
         if self.sensor:
             tables["sensor"] = {**tables.get("sensor", {}), **dict(self.sensor)}
         tables["page"] = {"listen": DEFAULT_LISTEN}
-        for section, broker in brokers.items():
-            tables[section] = {**tables.get(section, {}), **broker}
-        return tables
+        return tables | ({"mqtt": dict(brokers["mqtt"])} if "mqtt" in brokers else {})

@@ -10,7 +10,8 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
-from bms_estimator.setup.measurement import first_sample_timeout_s, open_pack_source
+from bms_estimator.setup.measurement import first_sample_timeout_s
+from bms_estimator.sources.factory import open_source
 
 MAX_RESTING_C = 0.1
 """Current relative to the capacity [1/h]. Above it, the overvoltage makes the first estimate inexact."""
@@ -66,7 +67,7 @@ async def run_estimator(
         count += 1
         on_estimate(received)
 
-    source = open_pack_source(settings)
+    source = open_source(settings)
     await run_estimation_loop(settings, cell, source=source, sinks=[EstimateSink(on_received)], stop=stop)
     timer.cancel()
     if not count:

@@ -1,6 +1,9 @@
 """Device that the search found, and its settings."""
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.settings_template import GivenSettings
@@ -8,6 +11,8 @@ from bms_estimator.setup.broker_login import BrokerLogin
 
 NAME_SEPARATOR = ":"
 """Separator between profile and address in ``FoundDevice.name``."""
+SAME_PACK = 0.02
+"""Maximum difference of the voltages of two devices of one pack, as a fraction."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +26,8 @@ class FoundDevice:
     """Settings of the device: ``[sensor]`` or ``[source]``."""
     cells: int | None = None
     """Number of cells in series, if the device reports it."""
+    voltage_v: float | None = None
+    """Voltage that was received during the search [V]; None: none was received."""
     values: str = ""
     """Values that were received during the search, as text; empty if the search received none."""
     broker: BrokerLogin | None = None
@@ -29,14 +36,55 @@ class FoundDevice:
     @property
     def settings(self) -> Settings:
         """Settings of a pack with this device. All other settings have their defaults, with which nothing is published."""
-        source = dict(self.tables.get("source", {}))
-        if self.broker is not None:
-            source |= self.broker.temporary_settings
-        return Settings.model_validate({**self.tables, **({"source": source} if source else {})})
+        return Settings.model_validate(self.tables_with(self.broker.temporary_settings if self.broker else {}))
+
+    def tables_with(self, broker: Mapping[str, object]) -> dict[str, dict[str, Any]]:
+        """Return the settings of the device, in which each MQTT source has these settings of its broker."""
+        return {name: _with_broker(table, broker) for name, table in self.tables.items()}
+
+    @property
+    def has_cells(self) -> bool:
+        """True if the device is a BMS, which measures its cells."""
+        return self.cells is not None or self.tables.get("source", {}).get("kind") == "ble"
 
     def __str__(self) -> str:
         """Describe the device with the received values."""
         return f"{self.description}; {self.values}" if self.values else self.description
+
+
+def with_pairs(devices: Sequence[FoundDevice]) -> list[FoundDevice]:
+    """Return the devices, and each pair of a battery monitor, such as a shunt, and a BMS that may be of one pack."""
+    pairs = [
+        _pair(a, b) for a in devices for b in devices if b.has_cells and not a.has_cells and _may_be_of_one_pack(a, b)
+    ]
+    return [*devices, *pairs]
+
+
+def _may_be_of_one_pack(monitor: FoundDevice, bms: FoundDevice) -> bool:
+    """Return True unless the voltages differ, or the devices publish to two brokers."""
+    if monitor.broker and bms.broker and monitor.broker != bms.broker:
+        return False
+    if monitor.voltage_v is None or bms.voltage_v is None:
+        return True
+    return math.isclose(monitor.voltage_v, bms.voltage_v, rel_tol=SAME_PACK)
+
+
+def _pair(monitor: FoundDevice, bms: FoundDevice) -> FoundDevice:
+    """Return a device with current and voltage of a battery monitor, and cells and temperatures of a BMS."""
+    return FoundDevice(
+        name=f"{monitor.name}+{bms.name}",
+        description=f"{monitor.description}, with cells and temperatures of {bms.name}",
+        tables={**monitor.tables, "bms": bms.tables},
+        cells=bms.cells,
+        values=monitor.values,
+        broker=monitor.broker or bms.broker,
+    )
+
+
+def _with_broker(table: Mapping[str, Any], broker: Mapping[str, object]) -> dict[str, Any]:
+    """Return a table of settings, with the settings of a broker if it, or a table in it, is an MQTT source."""
+    inner = {key: _with_broker(each, broker) if isinstance(each, Mapping) else each for key, each in table.items()}
+    return {**inner, **broker} if table.get("kind") == "mqtt" else inner
 
 
 def values_text(voltage_v: float, current_a: float) -> str:

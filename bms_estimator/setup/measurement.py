@@ -10,9 +10,8 @@ import numpy as np
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import Settings
 from bms_estimator.setup.found_device import values_text
-from bms_estimator.sources.factory import open_line_source
-from bms_estimator.sources.serial.serial_source import SerialSource
-from bms_estimator.sources.source import ReceivedSamples, Source
+from bms_estimator.sources.factory import open_source
+from bms_estimator.sources.source import ReceivedSamples
 
 FIRST_SAMPLE_S = 15.0
 """Timeout of the first sample [s]. A board needs up to 3 s after its port was opened, a Bluetooth BMS up to 15 s."""
@@ -41,16 +40,6 @@ class Measurement:
         return values_text(self.voltage_v, self.current_a) + soc + capacity
 
 
-def open_pack_source(settings: Settings) -> Source:
-    """Return the source of a pack. It neither reads nor writes the state folder.
-
-    Raises:
-        UserError: A setting is invalid.
-        ModuleNotFoundError: The optional package of the source is missing.
-    """
-    return open_line_source(settings) or SerialSource(settings.sensor)
-
-
 def first_sample_timeout_s(settings: Settings, response_s: float | None = None) -> float:
     """Return the timeout of the first sample [s].
 
@@ -74,7 +63,7 @@ async def measure(settings: Settings, response_s: float | None = None) -> Measur
     """
     timeout_s = first_sample_timeout_s(settings, response_s)
     blocks = list[ReceivedSamples]()
-    async with open_pack_source(settings) as source:
+    async with open_source(settings) as source:
         received = aiter(source)
         try:
             async with asyncio.timeout(timeout_s):

@@ -19,8 +19,6 @@ MAX_PUBLISHERS = 1000
 """Maximum number of publishers that are stored. Messages of further publishers are ignored."""
 MIN_LIVE_MESSAGES = 3
 """Minimum number of messages with a voltage or a current that show how a publisher sends."""
-SAME_PACK = 0.02
-"""Maximum difference of the voltages of two devices of one pack, as a fraction."""
 MAX_SILENT_S = 300.0
 """Setting ``source.max_silent_s`` of a publisher that sends only changes [s]."""
 _PLACEHOLDER = re.compile(r"\{(prefix|instance|cell|probe)\}")
@@ -89,13 +87,7 @@ class PublisherRecognition:
             value_counts[topic] = max(value_counts.get(topic, 0), len(values))
         best = [p for p, values in complete.items() if len(values) == value_counts[self._topics[p]]]
         best.sort(key=lambda p: (-len(complete[p]), p))
-        found = [_device(p, complete[p], broker, only_changes=self._sends_only_changes(p)) for p in best]
-        pairs = itertools.product(zip(best, found, strict=True), repeat=2)
-        return found + [
-            _combined(monitor, bms)
-            for (p, monitor), (q, bms) in pairs
-            if bms.cells and not monitor.cells and _are_of_one_pack(complete[p]["voltage"], complete[q]["voltage"])
-        ]
+        return [_device(p, complete[p], broker, only_changes=self._sends_only_changes(p)) for p in best]
 
     def _sends_only_changes(self, publisher: Publisher) -> bool:
         """Return True if most values arrived only as retained messages, others several times, and none was repeated."""
@@ -154,31 +146,6 @@ def _values(template: _Template, publisher: Publisher, topic: str, payload: byte
         return {}
 
 
-def _are_of_one_pack(voltage_v: float, other_v: float) -> bool:
-    """Return True if two voltages may be of one pack [V]."""
-    return abs(voltage_v - other_v) <= SAME_PACK * max(voltage_v, other_v)
-
-
-def _combined(monitor: FoundDevice, bms: FoundDevice) -> FoundDevice:
-    """Return a device with current and voltage of a battery monitor, such as a shunt, and cells and temperatures of a BMS."""
-    source = MqttSource.model_validate(bms.tables["source"])
-    locations = dict[str, list[dict[str, object]]]()
-    for name, location in source.locations():
-        if name in ("cells", "temperature"):
-            values = location.model_dump(exclude_defaults=True)
-            topics = [source.substitute(topic) for topic in location.topics]
-            locations.setdefault(name, []).append({**values, "topic": topics})
-    cells = {"cells": locations["cells"][0], "temperature": locations.get("temperature", [])}
-    return FoundDevice(
-        name=f"{monitor.name}+{bms.name}",
-        description=f"{monitor.description}, with cells and temperatures of {bms.name}",
-        tables={"source": {**monitor.tables["source"], **cells}},
-        cells=bms.cells,
-        values=monitor.values,
-        broker=monitor.broker,
-    )
-
-
 def _device(
     publisher: Publisher, values: Mapping[str, float], broker: BrokerLogin, *, only_changes: bool
 ) -> FoundDevice:
@@ -200,6 +167,7 @@ def _device(
         description=f"{MqttSource.model_validate(source).short_description}, {broker.url}",
         tables={"source": source},
         cells=cells or None,
+        voltage_v=values["voltage"],
         values=values_text(values["voltage"], sign * values["current"]),
         broker=broker,
     )

@@ -69,6 +69,15 @@ CHEMISTRIES: Mapping[str, str] = {
     "lto": "LTO, titanate: 2.4 V per cell",
 }
 """Descriptions of the generic cells by name."""
+USUAL_LIMITS_V: Mapping[str, tuple[float, float]] = {
+    "lfp": (3.5, 2.8),
+    "nmc": (4.2, 3.0),
+    "nca": (4.2, 3.0),
+    "lco": (4.2, 3.0),
+    "lmo": (4.2, 3.0),
+    "lto": (2.7, 1.8),
+}
+"""Usual voltages per cell at which the charger stops, and at which the BMS ends a discharge, by generic cell [V]."""
 SYNONYMS = {
     synonym.lower(): name
     for name, description in CHEMISTRIES.items()
@@ -78,7 +87,7 @@ SYNONYMS = {
 NO_BROKER = "none"
 """Answer for a service that publishes nothing over MQTT."""
 NO_LIMIT = "none"
-"""Answer for a current without a configured limit, and for a device whose SOC is not used."""
+"""Answer for a voltage or current without a configured limit, and for a device whose SOC is not used."""
 DEVICE_SOC_STD = "10"
 """Default standard deviation of the SOC by a device [%]. Counters of coulombs drift by about as much between two full charges."""
 
@@ -97,6 +106,10 @@ class Question:
     """Function that returns the default answer; empty without one."""
     choices: tuple[tuple[str, str], ...] = ()
     """Common answers with their descriptions."""
+    explanation: str = ""
+    """Explanation of the answer in one line; empty without one."""
+    hint: str = ""
+    """Meaning of an empty field on the page while the default is unknown."""
     is_asked: Callable[[Answers], bool] = lambda _: True
     """Function that returns False if the question does not concern this device."""
 
@@ -169,6 +182,42 @@ def _parse_series(text: str, answers: Answers) -> object:
 
 def _parse_parallel(text: str, _: Answers) -> object:
     return _validated(PackSettings, "parallel", _integer(text))
+
+
+def _parse_full_voltage(text: str, answers: Answers) -> object:
+    return None if text == NO_LIMIT else _parse_limit_v("full_voltage_v", text, answers, above_middle=True)
+
+
+def _parse_cutoff_voltage(text: str, answers: Answers) -> object:
+    return None if text == NO_LIMIT else _parse_limit_v("cutoff_voltage_v", text, answers, above_middle=False)
+
+
+def _parse_limit_v(key: str, text: str, answers: Answers, *, above_middle: bool) -> object:
+    """Return a voltage limit of the pack [V], above or below its voltage at SOC 0.5.
+
+    Raises:
+        InvalidAnswerError: Such a pack never has this voltage at that end.
+    """
+    value = _validated(PackSettings, key, parse_number(text, "V"))
+    if answers.cell is None or answers.series is None or not isinstance(value, float):
+        return value
+    cell = cell_voltages(answers.cell)
+    low_v, high_v = (cell.mid_v, cell.max_v) if above_middle else (cell.min_v, cell.mid_v)
+    if not answers.series * low_v <= value <= answers.series * high_v:
+        raise InvalidAnswerError(
+            f"{text}: must be {answers.series * low_v:.4g} to {answers.series * high_v:.4g} V, the voltage of "
+            f"{answers.series} {answers.cell} cells in series"
+        )
+    return value
+
+
+def _suggest_limit_v(answers: Answers, index: int) -> str:
+    """Return the usual voltage limit of the pack, empty before its cells are known; a shipped cell file has its own limits."""
+    if answers.cell is None or answers.series is None:
+        return ""
+    if answers.cell not in USUAL_LIMITS_V:
+        return NO_LIMIT
+    return f"{answers.series * USUAL_LIMITS_V[answers.cell][index]:g}"
 
 
 def _parse_max_discharge(text: str, _: Answers) -> object:
@@ -247,8 +296,33 @@ QUESTIONS = (
         _parse_capacity,
         _suggest_capacity,
     ),
-    Question("series", "Cells in series", "number of cells in series", _parse_series, _suggest_series),
+    Question(
+        "series",
+        "Cells in series",
+        "number of cells in series",
+        _parse_series,
+        _suggest_series,
+        hint="empty: the number that fits the measured voltage",
+    ),
     Question("parallel", "Cells in parallel", "number of cells in parallel", _parse_parallel, lambda _: "1"),
+    Question(
+        "full_voltage_v",
+        "Voltage of the pack at which its charger stops [V]",
+        f"voltage of the pack at which its charger stops, which is 100 % [V]; {NO_LIMIT}: that of the cell file",
+        _parse_full_voltage,
+        lambda answers: _suggest_limit_v(answers, 0),
+        explanation="This is 100 %: see the charger's manual. At a higher value than the charger reaches, 100 % is never reported.",
+        hint="empty: usual for the chemistry",
+    ),
+    Question(
+        "cutoff_voltage_v",
+        "Voltage of the pack at which its BMS ends a discharge [V]",
+        f"voltage of the pack at which its BMS ends a discharge, which is 0 % [V]; {NO_LIMIT}: that of the cell file",
+        _parse_cutoff_voltage,
+        lambda answers: _suggest_limit_v(answers, 1),
+        explanation="This is 0 %: see the settings of the BMS.",
+        hint="empty: usual for the chemistry",
+    ),
     Question(
         "max_discharge_a",
         "Largest discharge current of the pack by its rating or its BMS [A]",

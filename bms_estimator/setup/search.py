@@ -15,8 +15,8 @@ from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.settings.sources.modbus import PROFILES as MODBUS_PROFILES
-from bms_estimator.setup.broker_login import FORM, BrokerLogin
-from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice
+from bms_estimator.setup.broker_login import BrokerLogin
+from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice, with_pairs
 from bms_estimator.setup.measurement import measure
 from bms_estimator.setup.mqtt_recognition import PublisherRecognition
 from bms_estimator.sources.serial.device_detection import DetectedDevice, probe
@@ -36,7 +36,7 @@ DEFAULT_BROKER = str(MqttSettings.model_fields["url"].default)
 
 @dataclass
 class SearchResult:
-    """Devices that were found, and reasons why none was found elsewhere."""
+    """Devices that were found, each alone, and reasons why none was found elsewhere."""
 
     devices: list[FoundDevice] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
@@ -45,6 +45,11 @@ class SearchResult:
     """Broker that answered; None: no broker."""
     closed: list[BrokerLogin] = field(default_factory=list)
     """Brokers that require another user name or password."""
+
+    @property
+    def choices(self) -> list[FoundDevice]:
+        """Devices, and pairs of a battery monitor and a BMS, of which the user chooses one."""
+        return with_pairs(self.devices)
 
 
 def default_places() -> list[str]:
@@ -139,7 +144,7 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
                 pass
     except LoginError:
         reason = "requires a user name and a password" if login.username is None else "user name or password wrong"
-        result.failures.append(f"{url}: {reason}; give them as {FORM}")
+        result.failures.append(f"{url}: {reason}; give them as {url.replace('://', '://user:pw@')}")
         result.closed.append(login)
         return
     except BrokerConnectionError as error:
@@ -187,7 +192,11 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
             if "host" in address:
                 result.failures.append(f"{name}: {profile}: {error}")
         else:
-            result.devices.append(FoundDevice(device.name, device.description, device.tables, values=str(values)))
+            result.devices.append(
+                FoundDevice(
+                    device.name, device.description, device.tables, voltage_v=values.voltage_v, values=str(values)
+                )
+            )
 
 
 async def _search_bluetooth(result: SearchResult) -> None:

@@ -8,6 +8,9 @@ from collections.abc import Mapping
 
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.line_source import LineProducer, LineSource
+from bms_estimator.sources.paired_source import DeviceSource, PairedSource
+from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import ReadTap
 
 KINDS: Mapping[str, str] = {
@@ -34,8 +37,15 @@ def make_line_producer(settings: Settings) -> LineProducer | None:
     return line_producer
 
 
-def open_line_source(settings: Settings, *, tap: ReadTap | None = None) -> LineSource | None:
-    """Make the source that ``[source]`` selects; None without ``[source]``, for a serial port.
+def open_device(
+    settings: Settings, *, tap: ReadTap | None = None, board_file: KnownBoardFile | None = None
+) -> DeviceSource:
+    """Make the source of the device that measures voltage and current.
+
+    Args:
+        settings: Settings of the pack.
+        tap: Receives all bytes with their arrival times.
+        board_file: File with the board of the pack; None: each board is accepted.
 
     Raises:
         UserError: A setting cannot be used.
@@ -43,5 +53,26 @@ def open_line_source(settings: Settings, *, tap: ReadTap | None = None) -> LineS
     """
     producer = make_line_producer(settings)
     if producer is None:
-        return None
+        return SerialSource(settings.sensor, tap=tap, board_file=board_file)
     return LineSource(producer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)
+
+
+def with_bms(device: DeviceSource, settings: Settings) -> DeviceSource | PairedSource:
+    """Return the source of the pack: the device, with the BMS in ``[bms]`` if there is one.
+
+    Raises:
+        UserError: A setting cannot be used.
+        ModuleNotFoundError: An optional package is missing.
+    """
+    bms = settings.bms_only
+    return device if bms is None else PairedSource(device, open_device(bms), bms.sensor.sample_period_s)
+
+
+def open_source(settings: Settings) -> DeviceSource | PairedSource:
+    """Make the source of a pack. It neither reads nor writes the state folder.
+
+    Raises:
+        UserError: A setting cannot be used.
+        ModuleNotFoundError: An optional package is missing.
+    """
+    return with_bms(open_device(settings), settings)

@@ -43,7 +43,7 @@ def broker(find_program, deploy, tmp_path) -> Iterator[int]:
 
 
 def write_users(folder: Path, deploy: Path, passwd: str) -> None:
-    """Write passwords and access lists, as the commands of docs/pack/mosquitto.md do."""
+    """Write passwords and access lists, as the commands of docs/pack/integrations.md do."""
     passwords = folder / "bms.passwd"
     passwords.touch(mode=0o600)
     for user, password in PASSWORDS.items():
@@ -147,7 +147,7 @@ async def test_pack_receives_only_its_own_requests(broker):
 
 @pytest.fixture
 def tls_port(find_program, deploy, tmp_path) -> Iterator[int]:
-    """Yield the port of the listener for other machines, with certificates made by the commands of docs/pack/mosquitto.md."""
+    """Yield the port of the listener for other machines, with certificates made by the commands of docs/pack/integrations.md."""
     port = free_port()
     mosquitto, passwd = find_program("mosquitto", "mosquitto"), find_program("mosquitto_passwd", "mosquitto")
     find_program("openssl", "openssl")

@@ -13,9 +13,11 @@ from bms_estimator.doctor import device_check
 from bms_estimator.doctor.device_check import check_board, check_device
 from bms_estimator.doctor.finding import Level
 from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from tests.device_line import running_device
 from tests.doctor.as_user import as_nobody
 from tests.doctor.packs import subject
 from tests.patience import LONG_S
@@ -56,6 +58,16 @@ def test_a_silent_device_is_a_fault(tmp_path: Path, line: Line, monkeypatch: pyt
     assert device.level is Level.FAULT
     assert "no frame yet" in device.text
     assert "ports --probe" in device.remedy
+
+
+def test_another_number_of_cells_than_in_series_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_check, "FIRST_SAMPLE_S", LONG_S)
+    monkeypatch.setattr(device_check, "CELLS_S", 0.1)
+    bms = SimulatedBms("jk", lambda _: Reading(current_a=5.0, voltage_v=16.5, temperature_c=25.0), cells=5)
+    with running_device(bms) as port:
+        device, cells = check_device(subject(tmp_path, sensor={"port": port, "protocol": "jk"}))
+    assert device.level is Level.OK
+    assert (cells.level, cells.text) == (Level.WARNING, "5 cells are measured, but the pack has 4 in series")
 
 
 def test_a_missing_port_is_reported_only_by_the_check_of_the_port(tmp_path: Path) -> None:

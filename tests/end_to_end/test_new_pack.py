@@ -179,7 +179,8 @@ async def test_a_new_pack_is_calibrated_and_its_soc_is_within_the_band(
             await user.type(
                 *("new", "--device", board.path, "--voltmeter-v", f"{pack.voltage_v:.2f}", "--zero"),
                 *("--name", "house", "--cell", "lfp", "--capacity-ah", RATED_AH, "--series", SERIES),
-                *("--parallel", 1, "--max-discharge-a", "none", "--max-charge-a", "none"),
+                *("--parallel", 1, "--full-voltage-v", "none", "--cutoff-voltage-v", "none"),
+                *("--max-discharge-a", "none", "--max-charge-a", "none"),
                 *("--broker", broker.url, "--no-estimate", "--no-install"),
             )
             user.edit_settings("#sample_rate_hz = 100", "sample_rate_hz = 1")

@@ -18,7 +18,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_source
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
@@ -163,7 +163,7 @@ async def check_polling(broker: Broker, pack_settings: Settings, answers: Corout
 
 async def test_the_next_broker_is_tried_and_the_unreachable_one_is_named(broker: Broker) -> None:
     unreachable = f"mqtt://127.0.0.1:{free_port()}"
-    source = open_line_source(esphome_settings(broker, url=[unreachable, broker.url]))
+    source = open_source(esphome_settings(broker, url=[unreachable, broker.url]))
     assert source
     with capture_logs() as lines:
         async with asyncio.timeout(LONG_S), source, publishing(broker, "53.00", "-12.5"):

@@ -14,7 +14,7 @@ from tests.scripted_source import ScriptedSource
 @pytest.fixture
 def source(monkeypatch) -> ScriptedSource:
     scripted = ScriptedSource()
-    monkeypatch.setattr(measurement, "open_pack_source", lambda _: scripted)
+    monkeypatch.setattr(measurement, "open_source", lambda _: scripted)
     return scripted
 
 

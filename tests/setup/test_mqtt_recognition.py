@@ -5,10 +5,6 @@ from collections.abc import Mapping
 
 import pytest
 
-from bms_estimator.model.config_file import parse_toml
-from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.settings_template import settings_file
-from bms_estimator.settings.sources.mqtt import MqttSource
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.mqtt_recognition import PublisherRecognition
@@ -97,26 +93,6 @@ def test_a_publisher_of_changes_is_recognized_by_its_silent_topics() -> None:
             recognition.add_message("home/jk/sensor/jk_current/state", payload.encode())
         (device,) = recognition.devices(BROKER)
         assert device.tables["source"].get("max_silent_s") == expected
-
-
-def test_a_battery_monitor_and_a_bms_are_offered_together_for_one_pack_only() -> None:
-    """The combination has the current of the monitor, and cells and temperatures of the BMS."""
-    monitor = {
-        "N/c0ffee/battery/512/Dc/0/Voltage": '{"value": 52.9}',
-        "N/c0ffee/battery/512/Dc/0/Current": '{"value": 3}',
-    }
-    combined = find({**JK_NODE, **monitor})[-1]
-    assert (combined.name, combined.cells) == ("venus:c0ffee:512+esphome-jk:home/jk:jk", 2)
-    settings = parse_toml(
-        settings_file(Settings, combined.tables | {"mqtt": {"url": BROKER.url}}), Settings, "pack.toml"
-    )
-    assert isinstance(settings.source, MqttSource)
-    topics = {name: settings.source.topics(location) for name, location in settings.source.locations()}
-    assert topics["current"] == ["N/c0ffee/battery/512/Dc/0/Current"]
-    assert "home/jk/sensor/jk_cell_voltage_{cell}/state" in topics["cells"]
-    assert "home/jk/sensor/jk_temperature_sensor_{cell}/state" in topics["temperature"]
-    other_pack = {topic: payload.replace("52.9", "26.4") for topic, payload in monitor.items()}
-    assert len(find({**JK_NODE, **other_pack})) == 2
 
 
 def test_two_profiles_with_equally_many_values_are_both_offered() -> None:

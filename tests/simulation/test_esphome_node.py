@@ -8,7 +8,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.virtual_adc import Reading
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_source
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
@@ -19,7 +19,7 @@ async def test_the_mqtt_source_receives_current_with_its_sign_voltage_temperatur
     settings = Settings.model_validate(
         {"source": {"kind": "mqtt", "url": broker.url, "profile": "esphome-jk", "prefix": "bms7"}}
     )
-    source = open_line_source(settings)
+    source = open_source(settings)
     assert source
 
     def pack(time_s: float) -> Reading:

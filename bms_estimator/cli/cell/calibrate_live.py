@@ -35,7 +35,7 @@ from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_device
 from bms_estimator.sources.line_source import LineSource
 from bms_estimator.sources.serial.port_list import NoPortError, PortBusyError, open_port, resolve_port
 from bms_estimator.sources.serial.serial_source import SerialSource
@@ -244,9 +244,7 @@ class _LiveTest:
         stop = stop_on_signal()
         console, log = Console(stderr=True), deque[str]()
         configure_logs(log if console.is_terminal else None)
-        source = open_line_source(self._settings, tap=self._recording) or SerialSource(
-            self._settings.sensor, tap=self._recording
-        )
+        source = open_device(self._settings, tap=self._recording)
         self._switch = self._make_switch(source)
         async with source:
             # relay commands need a task that reads, so that reading ends last

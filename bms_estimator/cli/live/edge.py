@@ -21,7 +21,7 @@ from bms_estimator.process.state_folder import state_folder
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.pack import Settings, load_settings
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_device, with_bms
 from bms_estimator.sources.line_source import LineSource
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
@@ -56,14 +56,15 @@ async def serve_edge(
     stop, name = stop_on_signal(stop), settings.pack.name
     notifier = notifier or SystemdNotifier([name], activity="sending samples of")
     set_level(name, settings.log.level)
-    source = open_line_source(settings) or SerialSource(settings.sensor, board_file=KnownBoardFile(folder, name))
+    device = open_device(settings, board_file=KnownBoardFile(folder, name))
+    source = with_bms(device, settings)
     with instance_lock(folder, name):
         async with BlockSender(settings.edge, name, folder) as sender, source:
             notifier.ready(name)
             try:
                 await until_first_ends(
                     _send_samples(source, sender),
-                    _notify_alive(source, sender, notifier, name),
+                    _notify_alive(device, sender, notifier, name),
                     _log_blocks(sender),
                     stop.wait(),
                 )

@@ -21,8 +21,7 @@ from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
-from bms_estimator.sources.factory import open_line_source
-from bms_estimator.sources.serial.serial_source import SerialSource
+from bms_estimator.sources.factory import open_device
 from bms_estimator.sources.source import Source
 
 REDRAW_S = 0.25
@@ -80,7 +79,7 @@ async def _record(settings: Settings, recording: CaptureRecorder, seconds: float
     stop = stop_on_signal()
     console, log = Console(stderr=True), deque[str]()
     configure_logs(log if console.is_terminal else None)
-    async with open_line_source(settings, tap=recording) or SerialSource(settings.sensor, tap=recording) as source:
+    async with open_device(settings, tap=recording) as source:
         progress = Progress(source, recording)
         await until_first_ends(
             stop.wait(),

@@ -2,14 +2,15 @@
 
 import asyncio
 import math
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from bms_estimator.cli.options.capture_options import CELL_OR_FUEL_CELL_HELP, CapacityAh, complete_cell
 from bms_estimator.cli.options.number_options import decimal, whole
-from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.model.cell import Cell, is_fuel_cell, load_cell
+from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.one_of import suggestion
@@ -17,7 +18,7 @@ from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.mqtt import MqttSettings
-from bms_estimator.settings.pack import Settings
+from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.simulation.bms_answers import BMS_ANSWERS
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_bms import SimulatedBms
@@ -80,9 +81,13 @@ def simulate(
     mqtt: Annotated[
         str | None,
         typer.Option(
-            help="instead of a board, simulate an ESPHome node with a JK-BMS that publishes to this MQTT broker, mqtt://host:port",
+            help="instead of a board, simulate an ESPHome node with a JK-BMS that publishes to this MQTT broker, mqtt://host:port or with a login mqtt://user:pw@host",
             show_default=False,
         ),
+    ] = None,
+    password_file: Annotated[
+        Path | None,
+        typer.Option(help="with --mqtt mqtt://user@host: file with the password", show_default=False),
     ] = None,
     prefix: Annotated[
         str, typer.Option(help="with --mqtt: name of the ESPHome node, and first level of its topics")
@@ -137,13 +142,16 @@ def simulate(
     pack = SimulatedPack(model, LOADS[load](load_a, seed), soc=soc)
     if mqtt is not None:
         configure_logs()
-        # ``with_broker`` sets mqtt; the default only satisfies the type checker
-        broker = with_broker(Settings(), mqtt).mqtt or MqttSettings()
+        try:
+            login = BrokerLogin.parse(mqtt)
+        except ValueError as error:
+            raise UserError(f"--mqtt {without_secrets(mqtt)}: {error}") from None
+        broker = login.temporary_settings | ({"password_file": password_file} if password_file else {})
         cells = model.cell.series_count
         device = SimulatedNode(
             pack,
             cells=cells,
-            mqtt=broker,
+            mqtt=MqttSettings.model_validate(broker),
             prefix=prefix,
             speed=speed,
             seed=seed,

@@ -99,8 +99,11 @@ def _state_files(pack: Path, settings: Settings) -> Iterator[tuple[Path, list[Pa
 
 
 def _pattern(name: str) -> re.Pattern[str]:
-    """Return the pattern of the names of the files of a pack's state."""
-    return re.compile(rf"{re.escape(name)}(-[0-9a-f]{{8}})?\.[a-z0-9.-]+")
+    """Return the pattern of the names of the files of a pack's state.
+
+    Another pack may have a name like this one's with an identity, but its files have other suffixes.
+    """
+    return re.compile(rf"{re.escape(name)}(\.[a-z0-9.-]+|-[0-9a-f]{{8}}\.(((history|load)\.)?npz|changes-\d))")
 
 
 def _read(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:

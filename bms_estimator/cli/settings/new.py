@@ -82,16 +82,22 @@ def new(
     ] = None,
     series: Annotated[str | None, typer.Option(metavar="<int>", help=QUESTIONS[3].help, show_default=False)] = None,
     parallel: Annotated[str | None, typer.Option(metavar="<int>", help=QUESTIONS[4].help, show_default=False)] = None,
-    max_discharge_a: Annotated[
+    full_voltage_v: Annotated[
         str | None, typer.Option(metavar="<float>", help=QUESTIONS[5].help, show_default=False)
     ] = None,
-    max_charge_a: Annotated[
+    cutoff_voltage_v: Annotated[
         str | None, typer.Option(metavar="<float>", help=QUESTIONS[6].help, show_default=False)
     ] = None,
-    device_soc_std: Annotated[
+    max_discharge_a: Annotated[
         str | None, typer.Option(metavar="<float>", help=QUESTIONS[7].help, show_default=False)
     ] = None,
-    broker: Annotated[str | None, typer.Option(help=QUESTIONS[8].help, show_default=False)] = None,
+    max_charge_a: Annotated[
+        str | None, typer.Option(metavar="<float>", help=QUESTIONS[8].help, show_default=False)
+    ] = None,
+    device_soc_std: Annotated[
+        str | None, typer.Option(metavar="<float>", help=QUESTIONS[9].help, show_default=False)
+    ] = None,
+    broker: Annotated[str | None, typer.Option(help=QUESTIONS[10].help, show_default=False)] = None,
     estimate: Annotated[
         bool, typer.Option("--estimate/--no-estimate", help="run the estimator for some seconds, and show the SOC")
     ] = True,
@@ -119,7 +125,8 @@ def new(
         options = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
         sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
         answers = replace(answers, measured=measured, name=file.stem, sensor=sensor)
-        given = (name, cell, capacity_ah, series, parallel, max_discharge_a, max_charge_a, device_soc_std, broker)
+        limits = (full_voltage_v, cutoff_voltage_v, max_discharge_a, max_charge_a)
+        given = (name, cell, capacity_ah, series, parallel, *limits, device_soc_std, broker)
         for question, option in zip(QUESTIONS, given, strict=True):
             if option is not None or question.is_asked(answers):
                 answers = _ask(prompts, question, option, answers)
@@ -164,7 +171,7 @@ def _search(places: Sequence[str], earlier: Sequence[FoundDevice] = ()) -> Searc
         result = asyncio.run(search(places))
     names = [device.name for device in earlier]
     result.devices = [*earlier, *(device for device in result.devices if device.name not in names)]
-    for number, device in enumerate(result.devices, start=1):
+    for number, device in enumerate(result.choices, start=1):
         typer.echo(f"{number}  {device.name}: {device}")
     for failure in result.failures:
         typer.echo(f"-  {failure}")
@@ -183,7 +190,7 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
     may_search = prompts.is_interactive and device is None
     while True:
         parse = partial(_parse_device, result=result, may_search=may_search)
-        default = "1" if len(result.devices) == 1 else ""
+        default = "1" if len(result.choices) == 1 else ""
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
             return Answers(chosen, found_broker=result.broker)
@@ -213,14 +220,14 @@ def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> Found
     Raises:
         InvalidAnswerError: There is no device with this number or name. If the search failed there, the message gives its reason.
     """
-    for number, device in enumerate(result.devices, start=1):
+    for number, device in enumerate(result.choices, start=1):
         if text in (str(number), device.name):
             return device
     if text.isdigit() or not may_search:
         for failure in result.failures:
             if failure.startswith(f"{text}: "):
                 raise InvalidAnswerError(failure)
-        names = ", ".join(device.name for device in result.devices) or "no device"
+        names = ", ".join(device.name for device in result.choices) or "no device"
         raise InvalidAnswerError(f"{text}: was not found; found: {names}")
     return text
 
@@ -245,6 +252,8 @@ def _ask(prompts: Prompts, question: Question, given: str | None, answers: Answe
     if prompts.is_interactive and given is None:
         for choice, description in question.choices:
             typer.echo(f"  {choice:4} {description}")
+        if question.explanation:
+            typer.echo(f"  {question.explanation}")
     return prompts.ask(
         question.text,
         question.option,

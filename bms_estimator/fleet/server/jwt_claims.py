@@ -102,7 +102,7 @@ _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
     # QoS 1; no client can subscribe to it directly. The MQTT topic filter bms/# includes bms.
     Role.EDGE: (("raw.{{name()}}",), ("edge.{{name()}}.awaits", "$MQTT.sub.>")),
     Role.DASHBOARD: ((), ("bms", "bms.>", "fleet", "fleet.>", "$MQTT.sub.>")),
-    Role.READER: (_READER_PUBLISH, _SUBSCRIBE),
+    Role.READER: (_READER_PUBLISH, (*_SUBSCRIBE, "hours.*")),
     Role.WORKER: (_WORKER_PUBLISH, _SUBSCRIBE),
     Role.SENDER: (("telemetry.*",), ("_INBOX.>", "ingest.*")),
     Role.MQTT_SENDER: (("telemetry.*",), ("ingest.*", "$MQTT.sub.>")),

@@ -99,8 +99,7 @@ function drawAlarms({ alarms, topics }) {
 }
 
 function alarmRow(a) {
-	const of = (x, label) => (f.isNumber(x) ? `${label}${f.digits(x)} ${a.unit ?? ""}`.trim() : "");
-	const facts = [a.severity, of(a.value, ""), of(a.limit, "limit "), a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched", a.watched === false && "cannot be watched", a.unknown_reason];
+	const facts = [a.severity, a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched", a.watched === false && "cannot be watched", a.unknown_reason];
 	return node("div", { class: `alarm ${a.severity}`, "data-alarm": a.name },
 		node("b", {}, f.words(a.name)), node("span", {}, a.text || a.unwatched_reason), node("small", {}, facts.filter(Boolean).join(" · ")));
 }

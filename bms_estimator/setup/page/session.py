@@ -88,7 +88,7 @@ class SetupSession:
         Raises:
             UserError: There is no such device, or no sample arrives.
         """
-        devices = {device.name: device for device in self.result.devices}
+        devices = {device.name: device for device in self.result.choices}
         if name not in devices:
             raise UserError("choose one of the devices")
         comparison = Comparison(devices[name])

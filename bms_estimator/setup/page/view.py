@@ -81,9 +81,9 @@ def _searching(session: SetupSession, _: str) -> str:
 def _device(session: SetupSession, form_key: str) -> str:
     devices = "".join(
         f'<label class="choice"><input type="radio" name="device" value="{escape(device.name)}"'
-        f"{' checked' if len(session.result.devices) == 1 else ''} required>"
+        f"{' checked' if len(session.result.choices) == 1 else ''} required>"
         f"<span><b>{escape(device.name)}</b> {escape(str(device))}</span></label>"
-        for device in session.result.devices
+        for device in session.result.choices
     )
     form = _form("device", form_key, devices, "Use this device") if devices else "<p>No device was found.</p>"
     failures = f'<ul class="note">{_items(session.result.failures)}</ul>' if session.result.failures else ""
@@ -164,6 +164,7 @@ def _question(session: SetupSession, question: Question) -> str:
     entered = session.texts.get(question.name, default)
     reason = session.invalid.get(question.name)
     error = f'<span class="bad" role="alert">{escape(reason)}</span>' if reason else ""
+    explanation = f'<span class="note">{escape(question.explanation)}</span>' if question.explanation else ""
     if question.choices:
         options = "".join(
             f'<option value="{name}"{" selected" if name == entered else ""}>{escape(text)}</option>'
@@ -171,9 +172,9 @@ def _question(session: SetupSession, question: Question) -> str:
         )
         control = f'<select name="{question.name}" required><option value=""></option>{options}</select>'
     else:
-        hint = "empty: the number that fits the measured voltage" if question.name == "series" and not default else ""
+        hint = "" if default else question.hint
         control = f'<input name="{question.name}" value="{escape(entered)}" placeholder="{hint}" autocomplete="off">'
-    return f"<label>{escape(question.text)}{control}{error}</label>"
+    return f"<label>{escape(question.text)}{explanation}{control}{error}</label>"
 
 
 def _number_field(name: str, text: str) -> str:

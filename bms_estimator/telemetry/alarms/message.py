@@ -21,8 +21,8 @@ def alarm_text(alarm: AlarmDefinition, value: float | None, reasons: Sequence[st
         reasons: Other causes, one sentence each.
         cause_cleared: True if the cause is gone but the alarm is latched.
     """
-    unit = f" {alarm.kind.unit}" if alarm.kind.unit else ""
-    numbers = "" if value is None else f": {value:.4g}{unit}, limit {alarm.limit:.4g}{unit}"
+    factor, unit = (100.0, " %") if alarm.kind.is_fraction else (1.0, f" {alarm.kind.unit}" if alarm.kind.unit else "")
+    numbers = "" if value is None else f": {factor * value:.4g}{unit}, limit {factor * alarm.limit:.4g}{unit}"
     text = f"{alarm.kind.fault}{numbers}; {alarm.kind.remedy}"
     return (LATCHED if cause_cleared else "") + "; ".join((text, *reasons))
 

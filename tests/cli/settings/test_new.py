@@ -16,6 +16,7 @@ import pytest
 from bms_estimator.protocols.firmware.messages import Hello
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import load_settings
+from bms_estimator.settings.sampling import ChargeLimits
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
@@ -34,6 +35,8 @@ ANSWERS = {
     "--capacity-ah": "100",
     "--series": "8",
     "--parallel": "1",
+    "--full-voltage-v": "none",
+    "--cutoff-voltage-v": "none",
     "--max-discharge-a": "60",
     "--max-charge-a": "none",
     "--device-soc-std": "none",
@@ -95,7 +98,14 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
         ("Cells in series", "4", "4: the device reports 8 cells in series"),
         ("Cells in series", "", "Cells in parallel"),
         ("Cells in parallel", "1.5", "1.5: must be a whole number"),
-        ("Cells in parallel", "", "Largest discharge current"),
+        ("Cells in parallel", "", "This is 100 %"),
+        (
+            "Voltage of the pack at which its charger stops",
+            "3.5",
+            "3.5: must be 26.36 to 31.2 V, the voltage of 8 lfp cells",
+        ),
+        ("Voltage of the pack at which its charger stops [^[]*\\[V\\] \\[28\\]", "", "This is 0 %"),
+        ("Voltage of the pack at which its BMS ends", "23", "Largest discharge current"),
         ("Largest discharge current", "-5", "-5.0: must be greater than 0"),
         ("Largest discharge current", "60 A", "Largest charge current"),
         ("Largest charge current", "", "Standard deviation of the device's SOC"),
@@ -123,6 +133,7 @@ def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
     settings = load_settings(file)
     assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 40.0, 8)
     assert (settings.pack.max_discharge_a, settings.pack.max_charge_a) == (60.0, None)
+    assert settings.charge_limits == ChargeLimits(full_voltage_v=28.0, cutoff_voltage_v=23.0)
     assert settings.pack.device_soc_std == 0.1
     assert (settings.sensor.port, settings.sensor.protocol, settings.mqtt) == (path, "jk", None)
     assert (settings.sensor.voltage_gain, settings.sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))

@@ -307,7 +307,7 @@ async def _run_worker(fleet: Fleet) -> None:
         assert any(Pointer.model_validate_json(pointer.value or b"").kept for pointer in pointers)
 
 
-async def test_reader_cannot_write(fleet: Fleet) -> None:
+async def test_reader_reads_everything_and_cannot_write(fleet: Fleet) -> None:
     letter = DeadLetter("p1", 1, "damaged", "w", b"block")
     async with fleet.program(Role.WORKER) as (worker, _), fleet.program(Role.READER) as (nc, rejections):
         await worker.jetstream().publish(letter.subject, letter.data, headers=letter.headers())
@@ -316,6 +316,10 @@ async def test_reader_cannot_write(fleet: Fleet) -> None:
         assert (await js.stream_info(subjects.RAW_STREAM)).config.name == subjects.RAW_STREAM
         hours = await js.pull_subscribe(subjects.hours(), "collector", stream=subjects.HOURS_STREAM)
         assert (await hours.consumer_info()).name == "collector"
+        live = await nc.subscribe(subjects.hours())  # as the fleet page does
+        await nc.flush()
+        await worker.publish(subjects.hours("p1"), b"row")
+        assert (await live.next_msg(LONG_S)).data == b"row"
         assert rejections == []
         consumers = ("$JS.API.CONSUMER.DELETE.RAW.p1", "$JS.API.CONSUMER.MSG.NEXT.RAW.p1")
         await assert_rejected(

@@ -15,7 +15,7 @@ from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.bluetooth.bms_sample import convert_sample
 from bms_estimator.sources.bluetooth.source import MIN_PYTHON_HEX
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_source
 
 
 class Sensor:
@@ -93,4 +93,4 @@ def test_invalid_settings_are_rejected(options: dict[str, object]) -> None:
 @pytest.mark.skipif(sys.hexversion >= MIN_PYTHON_HEX, reason="this Python is new enough")
 def test_old_python_is_rejected_with_the_needed_version() -> None:
     with pytest.raises(UserError, match=r"needs Python 3\.12 or newer; this is 3\."):
-        open_line_source(Settings.model_validate({"source": {"kind": "ble", "name": "a"}}))
+        open_source(Settings.model_validate({"source": {"kind": "ble", "name": "a"}}))

@@ -14,7 +14,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.can import CanSource
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_source
 from bms_estimator.sources.fieldbus.can import BUS_OFF_BIT, CanProducer
 from bms_estimator.sources.line_source import SourceUnavailableError
 from tests.patience import LONG_S, until
@@ -127,7 +127,7 @@ async def test_samples_of_a_profile_have_a_current_that_is_positive_on_discharge
     channel: str, sender: can.BusABC
 ) -> None:
     table = {"kind": "can", "profile": "pylontech-can", "interface": "virtual", "channel": channel}
-    line_source = open_line_source(Settings.model_validate({"source": table}))
+    line_source = open_source(Settings.model_validate({"source": table}))
     assert line_source is not None
     async with asyncio.timeout(LONG_S), line_source:
         blocks = aiter(line_source)

@@ -13,7 +13,7 @@ from pymodbus.constants import ExcCodes
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.modbus import ModbusSource
-from bms_estimator.sources.factory import open_line_source
+from bms_estimator.sources.factory import open_source
 from bms_estimator.sources.fieldbus.modbus import ModbusProducer
 from bms_estimator.sources.line_source import SourceUnavailableError
 from tests.free_port import free_port
@@ -228,7 +228,7 @@ async def test_samples_have_a_current_that_is_positive_on_discharge_and_continue
     table = {"kind": "modbus", "profile": "victron-gx", "host": "127.0.0.1", "tcp_port": port, "unit": UNIT}
     settings = Settings.model_validate({"source": table | {"poll_s": 0.02, "timeout_s": 1.0}})
     assert settings.sensor.voltage_resolution_v == 0.01
-    line_source = open_line_source(settings)
+    line_source = open_source(settings)
     assert line_source is not None
     async with asyncio.timeout(LONG_S), line_source:
         blocks = aiter(line_source)

@@ -1,0 +1,122 @@
+"""Source of a pack with two devices: a battery monitor for voltage and current, and a BMS for cells and temperatures."""
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Self
+
+import numpy as np
+
+from bms_estimator.model.clock import since_boot
+from bms_estimator.model.sample import NO_SOC, SampleStatus
+from bms_estimator.sources.line_source import LineSource
+from bms_estimator.sources.serial.serial_source import SerialSource
+from bms_estimator.sources.source import ReceivedSamples
+
+TEMPERATURES = "temperature_c", "temperature_min_c", "temperature_max_c"
+"""Fields of a sample with temperatures."""
+DeviceSource = LineSource | SerialSource
+"""Source with one device."""
+MAX_PERIODS, MIN_AGE_S = 3.0, 10.0
+"""Maximum age of the values of the BMS: in its sample periods, and its minimum [s]."""
+
+
+class PairedSource:
+    """Samples of a battery monitor with the latest cell voltages and temperatures of a BMS.
+
+    Without new values of the BMS, the samples have no cell voltages after a while, and the temperature of the monitor. An SOC by
+    the monitor takes precedence over that by the BMS.
+
+    Args:
+        monitor: Battery monitor.
+        bms: The BMS.
+        period_s: Sample period of the BMS [s].
+        monotonic: Monotonic clock [s].
+    """
+
+    def __init__(
+        self,
+        monitor: DeviceSource,
+        bms: DeviceSource,
+        period_s: float,
+        monotonic: Callable[[], float] = since_boot,
+    ) -> None:
+        self._monitor, self._bms, self._monotonic = monitor, bms, monotonic
+        self._max_age_s = max(MAX_PERIODS * period_s, MIN_AGE_S)
+        self._latest: ReceivedSamples | None = None
+        self._latest_s = -math.inf
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def counters(self) -> Mapping[str, int]:
+        """Counters of the monitor, and those of the BMS with the prefix ``bms_``."""
+        return {**self._monitor.counters, **{f"bms_{name}": count for name, count in self._bms.counters.items()}}
+
+    @property
+    def silence_reason(self) -> str | None:
+        """Reason why no samples of the monitor arrive; None while they arrive."""
+        return self._monitor.silence_reason
+
+    @property
+    def board(self) -> Mapping[str, str]:
+        """Properties of the monitor."""
+        return self._monitor.board
+
+    @property
+    def clock_ppm(self) -> float | None:
+        """Rate error of the monitor's clock [1e-6]; None if unknown."""
+        return self._monitor.clock_ppm
+
+    @property
+    def clock_fault(self) -> str:
+        """Description of a fault of the monitor's clock; empty without one."""
+        return self._monitor.clock_fault
+
+    async def __aenter__(self) -> Self:
+        """Open both devices."""
+        async with contextlib.AsyncExitStack() as stack:
+            await stack.enter_async_context(self._monitor)
+            await stack.enter_async_context(self._bms)
+            self._task = asyncio.create_task(self._read_bms(), name="BMS of a battery monitor")
+            self._exits = stack.pop_all()
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        """Close both devices."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait({self._task})
+        await self._exits.aclose()
+
+    async def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
+        """Yield the blocks of the monitor with the values of the BMS."""
+        async for received in self._monitor:
+            if self._task is not None and self._task.done():
+                self._task.result()  # raises the exception of the BMS's source
+            yield self._with_bms(received)
+
+    async def _read_bms(self) -> None:
+        async for received in self._bms:
+            self._latest, self._latest_s = received, self._monotonic()
+
+    def _with_bms(self, received: ReceivedSamples) -> ReceivedSamples:
+        """Return samples with the cell voltages, temperatures, SOC and capacity of the BMS, unless they are too old."""
+        bms, rows = self._latest, np.zeros(received.samples.size, int)
+        if bms is None or self._monotonic() - self._latest_s > self._max_age_s:
+            return received
+        samples, last = received.samples.copy(), bms.samples[-1]
+        if math.isfinite(last["temperature_c"]):
+            for name in TEMPERATURES:
+                samples[name] = last[name]
+            samples["status"] |= last["status"] & np.uint32(SampleStatus.PROBE_FAULT)
+        soc, capacity_ah = received.device_soc, received.device_capacity_ah
+        if not np.isfinite(soc).any():
+            soc = bms.device_soc[-1:][rows] if bms.device_soc.size else NO_SOC
+        return ReceivedSamples(
+            samples,
+            bms.cells_v[-1:][rows] if bms.cells_v.size else received.cells_v,
+            bms.probes[-1:][rows] if bms.probes.size else received.probes,
+            soc,
+            bms.device_capacity_ah if math.isnan(capacity_ah) else capacity_ah,
+        )
