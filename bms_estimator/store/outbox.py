@@ -215,7 +215,6 @@ class Outbox:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout_at(due_s):
                     await self._sync_requested.wait()
-        self._queue.rewind()  # unacknowledged messages in flight are queued again, so that they are written too
         await self._sync(write=True)
 
     def _must_write(self) -> bool:

@@ -5,6 +5,7 @@
 
 import asyncio
 import itertools
+import math
 import os
 import random
 import signal
@@ -27,8 +28,9 @@ from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.packs.pack_bucket import PackBucket, write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.simulation.block_publisher import run_edges
-from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
+from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
+from bms_estimator.fleet.worker.block_order import REQUEST_EVERY
 from bms_estimator.fleet.worker.heartbeats import assign_partitions
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.settings.mqtt import MqttSettings
@@ -79,7 +81,7 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
         edges, stop = SimulatedEdges(fleet, start_s=time.time(), speed=speed), asyncio.Event()
         settings = MqttSettings(url=tuple(f"mqtt://127.0.0.1:{port}" for port in cluster.mqtt_ports))
         publisher_task = asyncio.create_task(
-            run_edges(fleet, edges, settings, connections=2, stop=stop, report=lambda _: None)
+            run_edges(fleet, edges, settings, connections=2, stop=stop, report=lambda _: None, quiet_s=math.inf)
         )
         async with Heartbeats(nc) as heartbeats:
             await heartbeats.until_held(PARTITIONS, *workers)
@@ -104,7 +106,11 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
             edges.last = int(edges.next_number.max()) + BLOCKS_AFTER_KILLS
             processed_blocks = 0
             while processed_blocks < edges.last * PACKS:  # a busy machine may take longer than the limit of one wait
-                await heartbeats.until(lambda last, before=processed_blocks: count_blocks(last) > before)
+                try:
+                    async with asyncio.timeout(2.0 * RESEND_S):
+                        await heartbeats.until(lambda last, before=processed_blocks: count_blocks(last) > before)
+                except TimeoutError:  # a worker requests a missing block again only when later ones arrive
+                    edges.last += REQUEST_EVERY
                 processed_blocks = count_blocks(heartbeats.last)
         assert processed_blocks == edges.last * PACKS
         stop.set()
