@@ -23,7 +23,7 @@ HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/
 APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb addon docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month bank cells power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema compile-order notebook lock
+.PHONY: help venv apt audit check deb addon docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month electrochemical bank cells power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema compile-order notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -100,6 +100,9 @@ anywhere: venv ## SOC error from any starting point of real captures, e.g. make 
 
 month: venv ## SOC error over simulated weeks of use, day by day, e.g. make month ARGS="A123 --days 30 --seeds 1 2": minutes
 	@$(BIN)/python -m tests.estimator.month $(ARGS)
+
+electrochemical: venv ## SOC error over a week of cells that PyBaMM simulates, at 0 and 25 °C, e.g. make electrochemical ARGS="Ecker2015 --days 2": half an hour
+	@$(BIN)/python -m tests.estimator.month --electrochemical --days 7 $(ARGS)
 
 bank: venv ## the weakest cell of simulated banks: false alarms, detection and error of its SOC: up to 10 minutes
 	@$(BIN)/python -m tests.benchmarks.bank $(ARGS)

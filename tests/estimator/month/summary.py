@@ -6,6 +6,7 @@ from pathlib import Path
 from tests.conftest import SHARED_DATA
 from tests.estimator.anywhere.score import Score
 from tests.estimator.month.cases import Case
+from tests.estimator.month.electrochemical import RECORDED
 from tests.estimator.month.groups import GROUPS, group_score, title
 from tests.estimator.month.run import run
 from tests.estimator.month.sources import SOLAR
@@ -18,6 +19,7 @@ SMALL_CASES = (
     Case("LFP", "full_weekly", days=4),
     Case("LFP", "solar", SOLAR, declared_ah=20.0, days=4),
     Case("LG M50", "bicycle", days=7),
+    *RECORDED,
 )
 """Cases of the summary. They need no captures from outside the repository."""
 FIT_INTERVAL_S = 12.0 * 3600.0
