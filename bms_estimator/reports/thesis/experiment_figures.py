@@ -39,7 +39,7 @@ def figure_26(experiment: Experiment) -> Figure:
         grid = np.linspace(0.0, 1.0, 600)
         for color, test in zip(np.resize(COLORS, len(p.tests)), p.tests, strict=True):
             axes[0].errorbar(test.soc, test.ocv_v, 2.0 * test.std_v, fmt="o", ms=3, color=color, label=test.name)
-        if experiment.recorded is None:  # the simulated pack has the printed parameters
+        if experiment.recorded is None:  # Table 8 is of the pack that is simulated
             axes[0].plot(
                 grid, chen_mora(np.array(printed_values.TABLE_8), grid), ":", linewidth=2.4, label="(2.10), Table 8"
             )
