@@ -47,7 +47,7 @@ _CONTACT, _OFFSET, _WIRE = int(ReadingFault.CONTACT), int(ReadingFault.OFFSET), 
 
 
 @njit(cache=True)
-def unanswered_v(c: Record, voltage_v: float, reference_v: float) -> float:
+def missed_change_v(c: Record, voltage_v: float, reference_v: float) -> float:
     """Return the change of the median voltage of the cells since the last change of this reading [V].
 
     Args:
