@@ -148,6 +148,7 @@ def mark_sense_wires(cells: Records) -> None:
     """Mark neighbors with opposite offsets. Their sum is right, because only the tap between them is wrong."""
     for i in range(cells.size - 1):
         first, second = cells[i], cells[i + 1]
+        # an offset, or a wire that is marked already
         if first.fault >= _OFFSET and second.fault >= _OFFSET:
             larger_v = max(abs(first.offset_v), abs(second.offset_v))
             if abs(first.offset_v + second.offset_v) < OPPOSITE_TOLERANCE * larger_v:
