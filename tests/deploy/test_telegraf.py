@@ -98,8 +98,10 @@ def test_time_layout_is_rfc_3339() -> None:
 
 
 def test_topics_are_parsed_by_their_own_pattern() -> None:
-    for plugin in (STATE_INPUT, ALARM_INPUT):
-        assert [plugin["topics"][0]] == [parsing["topic"] for parsing in plugin["topic_parsing"]]
+    assert all(
+        plugin["topics"] == [parsing["topic"] for parsing in plugin["topic_parsing"]]
+        for plugin in (STATE_INPUT, ALARM_INPUT)
+    )
 
 
 def test_only_documented_options_are_used() -> None:

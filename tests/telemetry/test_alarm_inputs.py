@@ -54,8 +54,8 @@ def test_values_more_than_five_seconds_apart_do_not_end_a_loss(present: list[boo
 def test_gaps_count_neither_for_a_loss_nor_for_its_end() -> None:
     inputs, one = inputs_without_temperature(), np.ones(50, dtype=np.int64)
     counts = {"voltage": one, "current": one, "cells": one, "temperature": one}
-    after_gaps_s = np.zeros(50)  # a duration of 0 marks a gap before the sample
-    assert inputs.update(100.0 * np.arange(50), after_gaps_s, counts) == []
+    # a duration of 0 marks a gap before the sample
+    assert inputs.update(100.0 * np.arange(50), np.zeros(50), counts) == []
     assert inputs.lost == ("temperature",)
 
 

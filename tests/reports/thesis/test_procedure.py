@@ -60,8 +60,7 @@ def leaf_procedure(data):
 
 def test_a_constant_load_beyond_the_number_of_plots_is_not_drawn_as_a_step(samples):
     procedure = make_procedure(samples | {f"constant {i}": samples["constant"] for i in range(MAX_LOADS)})
-    assert constant_loads(procedure) == ["slow", "constant", "constant 0", "constant 1"]
-    assert step_loads(procedure) == ["steps"]
+    assert (len(constant_loads(procedure)), step_loads(procedure)) == (MAX_LOADS, ["steps"])
 
 
 @pytest.mark.parametrize("noise_a", [0.0, 0.01, 0.05])
