@@ -133,7 +133,7 @@ ablation-weeks: venv ## ablation of the slow fit over simulated weeks, e.g. make
 	@$(BIN)/python -m tests.benchmarks.weeks $(ARGS)
 
 fuzz: venv ## edited inputs to all readers of foreign bytes, e.g. make fuzz INPUTS=1000 ARGS="-k jbd": half an hour
-	INPUTS=$(INPUTS) $(BIN)/python -m pytest --numprocesses=2 --hypothesis-profile=long --timeout=7200 --show-capture=no tests/fuzz $(ARGS)
+	HYPOTHESIS_MAX_EXAMPLES=$(INPUTS) $(BIN)/python -m pytest --numprocesses=2 --hypothesis-profile=long --timeout=7200 --show-capture=no tests/fuzz $(ARGS)
 
 load: venv ## 5,000 frames/s for 10 min over a PTY, a day of serial bytes, attacks on listeners, alarms and a fleet, wear of the disk, e.g. make load ARGS="--minutes 1 --hours 2"
 	@$(BIN)/python -m tests.benchmarks.long_runs.endurance $(ARGS)

@@ -21,7 +21,10 @@ __all__ = ["broker", "disk_without_files", "firmware", "full_disk", "line"]
 # There is no deadline, because compilation and other processes make times meaningless.
 settings.register_profile("short", deadline=None, derandomize=True, database=None)
 settings.register_profile(
-    "long", deadline=None, max_examples=int(os.environ.get("INPUTS", "20000")), suppress_health_check=list(HealthCheck)
+    "long",
+    deadline=None,
+    max_examples=int(os.environ.get("HYPOTHESIS_MAX_EXAMPLES", "20000")),
+    suppress_health_check=list(HealthCheck),
 )
 settings.load_profile("short")
 
@@ -105,7 +108,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Return the folder of the real captures, or skip with the searched path."""
+    """Return the folder of the real captures. Without it, skip the test and name the path."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"real captures are absent: {SHARED_DATA} does not exist (docs/contributing/tests.md)")
     return SHARED_DATA

@@ -83,7 +83,7 @@ class Broker:
                 assert time.monotonic() < deadline, "mosquitto did not end"
 
 
-def closed_broker(folder: Path) -> Broker:
+def password_broker(folder: Path) -> Broker:
     """Return a broker that requires the user name ``owner`` and ``PASSWORD``, as that of Home Assistant does."""
     passwords = folder / "passwords"
     subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "owner", PASSWORD], check=True, capture_output=True)

@@ -1,6 +1,6 @@
-"""File with counters and alarms of a pack. It has the pack's name only, so that no edited setting loses them.
+"""File with counters and alarms of a pack. It is named by the pack only, so that no edited setting loses them.
 
-Checksum in the first line of a file, so that any damage is recognized.
+A checksum in its first line reveals any damage. Other files use the same checksum.
 """
 
 import contextlib

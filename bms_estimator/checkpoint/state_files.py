@@ -41,7 +41,7 @@ from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack.state import CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, Declared, PackState
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
-from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.settings.pack import Settings
 
 FORMAT = 8
@@ -260,7 +260,7 @@ class StateFiles:
         self.history = ArraysFile(folder, settings, model, HISTORY_SUFFIX)
         self.load = ArraysFile(folder, settings, model, LOAD_SUFFIX)
         self.run_file = RunFile(folder, settings.pack.name, lambda: now().wall_s)
-        self.thread = DiskThread("checkpoint")
+        self.thread = DaemonThreadExecutor("checkpoint")
 
     def newest(self) -> "StateFiles":
         """Return the files of the pack's last run, whose declared capacity may be another one; without any, these files."""

@@ -1,13 +1,9 @@
-"""Cell as JSON with a published schema, docs/reference/cell.schema.json.
+"""Export of a cell as JSON, whose schema is docs/reference/cell.schema.json, and as a Python module for PyBaMM and PyBOP.
 
-Parameters of PyBaMM's Thevenin model as the text of a Python module. PyBOP uses the same parameters.
-
-A cell with an RC ladder becomes a series resistance and six RC pairs. The voltage of a ladder's RC pair is x R(SOC), where x
+The Python module has the parameters of PyBaMM's Thevenin model. A cell with an RC ladder becomes a series resistance and six RC pairs. The voltage of a ladder's RC pair is x R(SOC), where x
 is the filtered current, so that the voltage follows a change of R at once. The voltage v of PyBaMM's RC pair relaxes towards
-I R. Both voltages are equal if PyBaMM gets the effective resistance R / (1 + tau I R'(SOC) / (3600 Q R)), which follows from
-dv/dt = R dx/dt + x R'(SOC) dSOC/dt.
-
-A cell without an RC ladder becomes R_s and the two RC pairs (2.5)-(2.9) of the thesis.
+I R. Both voltages are equal if PyBaMM gets the capacitance tau / R, and in place of R the effective resistance
+R / (1 + tau I R'(SOC) / (3600 Q R)), because dv/dt = R dx/dt + x R'(SOC) dSOC/dt. A cell without an RC ladder becomes R_s and the two RC pairs (2.5)-(2.9) of the thesis.
 """
 
 import json
@@ -111,7 +107,7 @@ class ModelConstants(Strict):
     strong_j_per_mol: float = Field(default=STRONG_J, description="activation energy of strong_ohm [J/mol]")
     hysteresis_j_per_mol: float = Field(default=HYSTERESIS_J, description="activation energy of hysteresis_v [J/mol]")
     hysteresis_soc: float = Field(
-        default=Noise().hysteresis_soc,
+        default=Noise().hysteresis_soc,  # a default of the filter that every cell uses
         description="change of SOC after which 1/e of the way to the other OCV branch remains",
     )
     reference_c: float = Field(

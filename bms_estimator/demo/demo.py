@@ -18,7 +18,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from bms_estimator.demo.true_soc import TrueSoc
+from bms_estimator.demo.true_soc import PackWithSocHistory
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
@@ -45,7 +45,7 @@ MQTT_PORT = 1883
 LOOPBACK = "127.0.0.1"
 POLL_S = 0.02
 """Interval at which the server's start is checked [s]."""
-START_S = 60.0
+START_TIMEOUT_S = 60.0
 """Timeout of the server's start [s]. It is long because the machine may be busy."""
 
 
@@ -60,7 +60,7 @@ class DemoBroker:
     """
 
     def __init__(self, port: int | None = None) -> None:
-        self.port = choose_port(port, MQTT_PORT)
+        self.port = choose_port(port, MQTT_PORT, "--port")
         self._server = find_server()
         self._stack = contextlib.AsyncExitStack()
 
@@ -101,7 +101,7 @@ class DemoBroker:
         )
         stack.push_async_callback(_terminate, process)
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(START_S):
+            async with asyncio.timeout(START_TIMEOUT_S):
                 while not _listens(folder) and process.returncode is None:  # noqa: ASYNC110 - the server reports its start only by a file
                     await asyncio.sleep(POLL_S)
         if not _listens(folder):
@@ -130,15 +130,20 @@ mqtt {{ listen: "{LOOPBACK}:{mqtt_port}" }}
 """
 
 
-def choose_port(port: int | None, default_port: int) -> int:
+def choose_port(port: int | None, default_port: int, option: str) -> int:
     """Return the port to listen on: the requested port; without one, the default port or any free port.
 
+    Args:
+        port: Requested port; None: no request.
+        default_port: Port that is preferred without a request.
+        option: Option that requests the port, for the error.
+
     Raises:
-        UserError: The requested port is in use.
+        UserError: The requested port is in use, or the user may not open it.
     """
     if port is not None:
         if not _is_free(port):
-            raise UserError(f"port {port}: taken by another program; leave --port out to have a free one chosen")
+            raise UserError(f"port {port}: in use or not permitted; without {option} a free port is chosen")
         return port
     return default_port if _is_free(default_port) else _any_free_port()
 
@@ -171,10 +176,11 @@ TRUE_SOC = 0.9
 INITIAL_SOC = 0.7
 """Wrong initial SOC of the estimator, which assumes a std of 0.2."""
 SLOWDOWN = 500.0
-"""Factor by which the thesis's weights of the bounds in (3.18) are divided. With the printed weights a1..a12 reach their limits within
-half a second, too fast to be watched. A common factor does not change the limits."""
+"""Divisor of the weights in the adaptive law (3.18) of the thesis. With the printed weights, the law moves a1..a12 to their limits
+within half a second, too fast to be watched. A common divisor slows it down and leaves the limits unchanged."""
 REST_S = 60.0
-"""Rest of the cell while a1..a12 move [s]. (4.2) needs their limits, and starts from rest, where the RC voltages are known."""
+"""Rest of the cell while a1..a12 move [s]. R_s by (4.2) can be computed only after they have reached their limits, and only from a
+rest on, at which the RC voltages are known."""
 RESOLUTION_V = 5e-3
 """Resolution of the board's voltage [V]. The board averages noisy conversions, so that it is a fifth of the converter's
 step."""
@@ -204,7 +210,8 @@ async def run_demo(
         port: Port of the broker; None: 1883, or any free one.
         page_port: Port of the live page; None: 8765, or any free one.
         seconds: Duration [s]; None: until a signal.
-        thesis: True to run the thesis's method without the identifier. It counts the SOC, and therefore starts with the true one.
+        thesis: True to run the thesis's method without the identifier. It only counts the charge and cannot correct the SOC, so
+            that it starts with the true SOC.
         log: Log lines that the terminal view shows.
         opened: Called with the address of the live page once it is served.
 
@@ -214,11 +221,12 @@ async def run_demo(
     stop = stop_on_signal()
     cell = load_cell(CELL)
     load = chain([(REST_S, 0.0)] if thesis else [], random_steps(LOAD_A))
-    truth = TrueSoc(SimulatedPack(cell, load, soc=TRUE_SOC))
+    pack = PackWithSocHistory(SimulatedPack(cell, load, soc=TRUE_SOC))
     initial_soc = TRUE_SOC if thesis else INITIAL_SOC
-    result = DemoResult(initial_soc - TRUE_SOC, truth.soc)
-    async with DemoBroker(port) as broker, _running_board(truth, rate_hz, speed) as board:
-        page = f"{LOOPBACK}:{choose_port(page_port, parse_listen(DEFAULT_LISTEN).port)}"
+    result = DemoResult(initial_soc - TRUE_SOC, pack.soc)
+    page_port = choose_port(page_port, parse_listen(DEFAULT_LISTEN).port, "--page-port")
+    async with DemoBroker(port) as broker, _running_board(pack, rate_hz, speed) as board:
+        page = f"{LOOPBACK}:{page_port}"
         hint = f"live page: http://{page}/; in a second terminal: {broker.subscribe_command}"
         if not sys.stdout.isatty():
             sys.stdout.write(f"{hint}\n")
@@ -227,18 +235,18 @@ async def run_demo(
         settings = _settings(board, broker.url, page, rate_hz, initial_soc)
         if thesis:
             settings = settings.model_copy(update={"identifier": IdentifierSettings(enabled=False)})
-            cell = _with_slow_law(cell)
-        view = TerminalSink(log=log, hint=hint, true_soc=truth.soc)
+            cell = _with_slow_adaptation(cell)
+        view = TerminalSink(log=log, hint=hint, true_soc=pack.soc)
         pages = Pages(opened)
         # the settings contain no state folder, so that each run starts with the initial state
-        await run_pack_service(settings, cell, sinks=[view, result], tap=truth, stop=stop, pages=pages)
+        await run_pack_service(settings, cell, sinks=[view, result], tap=pack, stop=stop, pages=pages)
     return result.summary()
 
 
 @asynccontextmanager
-async def _running_board(truth: TrueSoc, rate_hz: int, speed: float) -> AsyncIterator[str]:
+async def _running_board(pack: PackWithSocHistory, rate_hz: int, speed: float) -> AsyncIterator[str]:
     """Run a simulated board, and yield the path of its pseudo-terminal."""
-    with VirtualBoard(truth, rate_hz=rate_hz, speed=speed) as board:
+    with VirtualBoard(pack, rate_hz=rate_hz, speed=speed) as board:
         task = asyncio.create_task(board.run_for_host())
         try:
             yield board.path
@@ -247,7 +255,7 @@ async def _running_board(truth: TrueSoc, rate_hz: int, speed: float) -> AsyncIte
             await asyncio.gather(task, return_exceptions=True)
 
 
-def _with_slow_law(cell: CellModel) -> CellModel:
+def _with_slow_adaptation(cell: CellModel) -> CellModel:
     """Return the cell with the weights of its bounds divided by ``SLOWDOWN``."""
     slow = {
         name: bounds.model_copy(
@@ -300,13 +308,13 @@ class DemoResult:
         estimate, elapsed_s = self._last, time.monotonic() - self._started_s
         if estimate is None or estimate.soc is None:
             return f"{elapsed_s:.1f} s, no sample arrived"
-        soc_error, compared = estimate.soc - self._last_true_soc, f"beside the counted {estimate.soc:.2%}"
+        soc_error, compared = estimate.soc - self._last_true_soc, f", by coulomb counting {estimate.soc:.2%}"
         if estimate.soc_std is not None:
             band = BAND_STDS * estimate.soc_std
             inside = "inside" if abs(soc_error) <= band else "outside"
-            compared = f"{inside} the estimate {estimate.soc:.2%} ± {band:.2%} (2 std)"
+            compared = f" {inside} the estimate {estimate.soc:.2%} ± {band:.2%} (2 std)"
         return (
             f"{elapsed_s:.1f} s: {estimate.frames_received:,} frames, {estimate.frames_lost} lost, {estimate.crc_errors} CRC errors; "
-            f"SOC error {self._initial_error:+.2%} at the start, {soc_error:+.2%} at the end: true SOC {self._last_true_soc:.2%} "
+            f"SOC error {self._initial_error:+.2%} at the start, {soc_error:+.2%} at the end: true SOC {self._last_true_soc:.2%}"
             f"{compared}; observer {'in lock' if estimate.lock else 'out of lock'}"
         )

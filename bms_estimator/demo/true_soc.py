@@ -17,10 +17,10 @@ TAIL_BYTES = 256
 """Number of the board's last bytes that are stored, enough to contain a complete sample frame."""
 
 
-class TrueSoc:
-    """Simulated pack as a board's signal that remembers the SOC of each sample.
+class PackWithSocHistory:
+    """Simulated pack that a board measures, and that stores the SOC at each sample.
 
-    It is also a tap on the board's line: the board's clock in the last frame tells which sample the host has received.
+    It also reads the board's bytes: the board's clock in the last frame determines which sample the host has received.
 
     Args:
         pack: Simulated pack. The board may read it before the samples arrive at the host. Therefore past SOCs are

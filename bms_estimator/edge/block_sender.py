@@ -1,9 +1,7 @@
 """Sender of a pack's raw samples to a fleet's server, by MQTT, in blocks.
 
 ``BlockSender`` collects samples in blocks, sends the blocks and receives the workers' confirmations. ``BlockStore``
-stores blocks until a worker has confirmed them. Package ``mqtt`` connects to the server and reconnects.
-
-``SampleClock`` maps the clock of a source to a clock that never steps back.
+stores blocks until a worker has confirmed them. Package ``mqtt`` connects to the server and reconnects. ``SampleClock`` maps the clock of a source to a clock that never steps back.
 """
 
 import asyncio

@@ -139,7 +139,7 @@ def estimator_settings(
     p["learning"] = learning_settings(cell, observer, p["observer"])[0]
     p["identify"] = identifier.enabled
     # only these laws have the form (3.18); (3.16) and (3.17) have no limit that the identifier could set
-    p["hand_over"] = observer.law in ("improved", "scheme-3")
+    p["sets_targets"] = observer.law in ("improved", "scheme-3")
     p["series_resistance"] = observer.law == "improved" and not identifier.enabled
     p["map_memory_s"] = identifier.map_memory_h * 3600.0
     p["configured"][1:] = cell.a[1:PARAMETERS]

@@ -1,10 +1,7 @@
 """Present capability of a pack: available power, usable capacity, remaining energy, and time to full.
 
-These values need no forecast of the load, and therefore exist at rest and during a charge, too.
-
-States of the filter for the single cells that limit power and capacity of a pack in series.
-
-Each cell has a share of a limit of the pack's voltage: the limit divided by the number of cells in series. A pack whose cells all
+These values need no forecast of the load, and therefore exist at rest and during a charge, too. In a pack with cell voltages,
+single cells limit them. Each cell has a share of a limit of the pack's voltage: the limit divided by the number of cells in series. A pack whose cells all
 equal one cell reaches the limit when this cell reaches its share.
 """
 

@@ -112,7 +112,7 @@ class Forecaster:
         return other
 
     def latest_at(self, voltage_v: float, current_a: float, power_w: float) -> Forecast:
-        """Return the last forecast, in which no known available power is below the present power.
+        """Return the last forecast, with each known available power raised to at least the present power.
 
         Args:
             voltage_v: Present voltage [V].
@@ -131,11 +131,12 @@ class Forecaster:
             load: Expected load; None: a load like the observed one.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
+        # a current that the pack has already delivered or accepted is allowed, even if the settings do not give it
         limits = self._limits.with_seen(*self.load.seen_a)
         write_capability(values, self.estimator, self.cutoff_v, limits, self._largest_a, self.deviations)
-        reason = self._missing_state()
+        reason = self._reason_without_state()
         if reason is None and load is None:
-            reason = self._missing_load()
+            reason = self._reason_without_load()
         if reason is not None:
             return Forecast(time_s, values, reason, None)
         pack = self.projected_pack(load)
@@ -143,16 +144,18 @@ class Forecaster:
         if projection is None:
             return Forecast(time_s, values, "the load does not discharge the pack on average", None)
         _write_time_to_cutoff(values, projection)
-        if load is not None:
+        if load is not None:  # write_capability has written the value at the observed load
             values["usable_capacity_ah"] = np.median(projection.charge_as) / 3600.0
         return Forecast(time_s, values, None, projection.curve)
 
     def trip_curve(self, load: GivenLoad) -> ForecastCurve | None:
         """Return the curves from the present state until the end of a given load; None without a state."""
-        return None if self._missing_state() else project_trip(self.projected_pack(load), load, self.seed)
+        return None if self._reason_without_state() else project_trip(self.projected_pack(load), load, self.seed)
 
     def projected_pack(self, load: GivenLoad | None = None) -> Records:
-        """Return the present state of the pack under a load, shape (1,), dtype ``PROJECTED_PACK``.
+        """Return the pack from which a projection starts, shape (1,), dtype ``PROJECTED_PACK``.
+
+        It has the present state, and the resistance under the largest current of the load.
 
         Args:
             load: Expected load; None: a load like the observed one.
@@ -167,15 +170,15 @@ class Forecaster:
         time_bits = int(state["time_s"].view(np.uint64)[0])
         return (time_bits * _HASH_FACTOR + int(state["samples"][0])) % _SEED_COUNT
 
-    def _missing_state(self) -> str | None:
+    def _reason_without_state(self) -> str | None:
         """Return the reason why the pack cannot be projected; None if it can."""
-        if not self.estimator.identifying:
+        if not self.estimator.identifying:  # without the identifier there is no state of the filter to project
             return self.estimator.cell.no_forecast_reason
         if not self.estimator.record[0]["filter"]["started"]:
             return "no sample has been processed yet"
         return None
 
-    def _missing_load(self) -> str | None:
+    def _reason_without_load(self) -> str | None:
         """Return the reason why the observed load cannot represent the next one; None if it can."""
         if self.load.is_charging:
             return "the pack is being charged"
@@ -187,7 +190,7 @@ class Forecaster:
 
     @property
     def _largest_a(self) -> float:
-        """Largest mean current of a second of the observed load [A], at least 0. Shorter inrush currents do not count."""
+        """Largest one-second mean of the observed current [A], at least 0. Shorter inrush currents do not count."""
         return float(self.load.mean_a.max(initial=0.0))
 
     def _project(self, pack: Records, load: GivenLoad | None) -> Projection | None:
@@ -199,8 +202,8 @@ class Forecaster:
         current_a = mean_a - pack["offset_a"][0]
         if not discharges(pack, float(current_a.mean())):
             return None
-        analogues = self.past.analogues(mean_a.size // MINUTE_S)
-        return project_observed_load(pack, mean_a, max_a, load_spread(current_a), self.seed, analogues)
+        past_loads = self.past.analogues(mean_a.size // MINUTE_S)
+        return project_observed_load(pack, mean_a, max_a, load_spread(current_a), self.seed, past_loads)
 
 
 def _interval_s(forecast: Forecast) -> float:

@@ -1,6 +1,6 @@
 """Distribution of the time to the cut-off: Monte Carlo simulation of the pack under drawn or given loads.
 
-Reduction of a given load to fewer parts, so that a profile with a high resolution does not slow down a forecast.
+A given load is reduced to fewer parts, so that a profile with a high resolution does not slow down a forecast.
 """
 
 import math

@@ -51,6 +51,7 @@ def system_files(machine: Machine, program: Path) -> list[SystemFile]:
         SystemFile("unit", places.TEMPLATE, template),
         SystemFile("udev rule", places.UDEV_RULE, rule),
     ]
+    # where these daemons set the clock, the drop-in allows the service to ask the kernel whether it is synchronized
     if any(machine.path(daemon).exists() for daemon in places.CLOCK_DAEMONS):
         drop_in = (FILES / "clock.conf").read_text(encoding="utf-8")
         files += [SystemFile("unit", places.clock_drop_in(unit), drop_in) for unit in (places.UNIT, places.TEMPLATE)]
@@ -107,7 +108,7 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
     for file in system_files(machine, program):
         machine.write(file.path, file.text.encode())
         report(file.kind, str(file.path))
-    if machine.is_running:
+    if machine.has_running_systemd:
         reload_system()
     if not machine.path(places.PACK_FILE).exists() or (is_upgrade and pack is None and not _is_enabled(machine)):
         return False
@@ -117,7 +118,7 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
 
 
 def compile_ahead(program: Path) -> None:
-    """Compile the kernels that the program lacks into the cache of the service, as its user. The terminal shows a bar.
+    """Run the command ``compile`` as the user of the service, which shows a bar and fills the service's cache with missing kernels.
 
     Otherwise the start of the service would take minutes without an explanation. If the compilation fails, the service repeats it.
     """
@@ -188,7 +189,7 @@ def _require_same_pack(machine: Machine, pack: PackFiles) -> None:
         files = " ".join(map(str, pack.named))
         copy = f"\n  sudo install -m 640 -g {places.NAME} {files} {places.SETTINGS}" if files else ""
         raise UserError(
-            f"{places.PACK_FILE}: is the pack {before}, and {pack.settings} is {name}; to run both:{copy}\n"
+            f"{places.PACK_FILE}: has the settings of the pack {before}, but {pack.settings} those of {name}; to run both:{copy}\n"
             f"  sudo install -m 640 -g {places.NAME} {pack.settings} {target}\n"
             f"  sudo systemctl enable --now {places.NAME}@{name}\n"
             f"to replace {before}, remove {places.PACK_FILE} first"
@@ -248,7 +249,7 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
     all_units = places.UNIT, places.TEMPLATE
     units = [unit for unit in all_units if machine.path(unit).exists()]
     if units:
-        if machine.is_running:
+        if machine.has_running_systemd:
             run(["systemctl", "stop", places.UNIT.name, OTHER_PACKS])
         machine.run("systemctl", "disable", "--quiet", *(unit.name for unit in units))
         report("service", "stopped and disabled")
@@ -260,7 +261,7 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
         _remove(machine, name, report)
     for folder in drop_ins:
         _remove_if_empty(machine.path(folder))
-    if machine.is_running:
+    if machine.has_running_systemd:
         reload_system()
     for name in user_data:
         _give_to_root(machine.path(name))
@@ -288,6 +289,7 @@ def _remove_user(machine: Machine, report: Report) -> None:
     """Remove the user and its group. Whether ``userdel`` also removes the group depends on the distribution."""
     if machine.group_id(places.NAME) is None:
         return
+    # with --root, userdel would run in a chroot and need the libraries of the image
     machine.run("userdel", places.NAME, root_option="--prefix")
     if machine.group_id(places.NAME) is not None:
         machine.run("groupdel", places.NAME, root_option="--prefix")

@@ -35,7 +35,7 @@ class Machine:
         return path
 
     @property
-    def is_running(self) -> bool:
+    def has_running_systemd(self) -> bool:
         """True if systemd runs this machine, so that a service can be started."""
         return self.root == Path("/") and Path("/run/systemd/system").is_dir()
 

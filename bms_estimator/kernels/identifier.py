@@ -85,13 +85,13 @@ def identifier_step(
     if gap and not c.suspects & UNUSABLE and gap_begins_empty(s.anchors, dt_s):
         correct_at_anchor(s, p, EMPTY)
     integrate_current(f, p.filter, dt_s, gap, current_a, temperature_c)
-    if dt_s > p.filter.unmeasured_s:
+    if dt_s > p.filter.unmeasured_s:  # the current between the samples is unknown
         s.unlearned_s[:] += dt_s
     unknown_soc = f.window.unknown_as / p.filter.capacity_as
     if gap and dt_s >= p.filter.unmeasured_s:
         f.window.gap = LONG_GAP
     may_hide_charge = f.window.gap == LONG_GAP or (f.window.gap and unknown_soc > MAX_SINGLE_STD)
-    # after a gap that ended without a voltage, the first voltage selects
+    # the SOC after such a gap needs a voltage: if the gap ended without one, the filter restarts at the first voltage after it
     if measured and may_hide_charge and not c.suspects & UNUSABLE:
         restart_filter(s, p, f.window.time_s, current_a, voltage_v)
         s.fit_age_s += dt_s
@@ -103,7 +103,7 @@ def identifier_step(
         detect_current_step(f, p.filter, s.observer.voltage_age_s, change_a, voltage_v)
         add_to_window(f, current_a, voltage_v)
     else:
-        f.step.phase = UNHELD
+        f.step.phase = UNHELD  # without the voltage, the current step determines no R_s
     if f.window.time_s >= WINDOW_S and f.window.samples > 0:
         update_from_window(s, p)
     s.observer.soc = f.soc
@@ -118,7 +118,7 @@ def coast(s: Record, p: Record, dt_s: float, current_a: float) -> None:
     f, c = s.filter, s.checks
     fault_s, charge_as, soc_std = f.window.time_s, f.window.charge_as, f.soc_std
     coast_without_voltage(c, f, p.filter, dt_s, current_a)
-    if not c.suspects & UNUSABLE:
+    if not c.suspects & UNUSABLE:  # the fault has just ended
         begin_segment(s.history, fault_s, charge_as, soc_std * p.filter.capacity_as)
 
 
@@ -170,7 +170,8 @@ def correct_at_anchor(s: Record, p: Record, kind: int) -> None:
         apply_anchor(f, p.filter, 0.0, a.empty_std)
     a.soc_after = f.soc
     if not c.suspects & UNUSABLE:
-        c.last_v = 0.0  # no previous sample: if the sensor freezes now, the SOC before the anchor must not be restored
+        # 0 means no previous voltage: a sensor that freezes now must not restore the SOC from before the anchor
+        c.last_v = 0.0
     store_last_good_state(c, f)
 
 
@@ -223,14 +224,15 @@ def add_element_to_map(s: Record, row: int, j: int, identified: bool, dt_s: floa
 def set_adaptation_targets(s: Record, p: Record, e: int) -> None:
     """Set the fitted parameters of an element, within the configured bounds, as limits of (3.18).
 
-    ``e`` is the row of the map. By Lemma 4.1.3 of the thesis, (3.18) depends on its bounds only through the limit to which
-    a parameter converges. Parameters that no law adapts (a13..a15 of R_s in the improved method) get the fitted values at
-    once. A capacitance that is negative at the present SOC is not set, because it would end the adaptation (erratum 14).
+    ``e`` is the row of the map. The limit is set directly and not by new bounds, because (3.18) depends on its bounds only through
+    the limit to which a parameter converges (Lemma 4.1.3 of the thesis). Parameters that no law adapts, a13..a15 of R_s with
+    ``law = "improved"``, get the fitted values at once. A capacitance that is negative at the present SOC is not set, because it would end the adaptation (erratum 14).
     """
-    if p.hand_over == 0 or s.fit.bins[e] < MIN_BINS:
+    if p.sets_targets == 0 or s.fit.bins[e] < MIN_BINS:
         return
     i = 3 * e + 1  # index of the amplitude: a1, a4, a7, a10 or a13
     amplitude, exponent, offset = fit_within(s.fit, e, p.lower, p.upper)
+    # the capacitance is negative below the SOC delta
     if e in CAPACITANCES and delta(exponent, offset, amplitude) + p.observer.margin_guard >= s.observer.soc:
         return
     set_target(s.observer, p.observer, i, amplitude)

@@ -25,7 +25,7 @@ ESTIMATOR_SETTINGS = np.dtype(
         ("anchors", ANCHOR_SETTINGS),
         ("identify", "i8"),  # 1: the filter runs; 0: SOC by coulomb counting, parameters as configured
         ("series_resistance", "i8"),  # 1: R_s by (4.2), step 3 of the thesis
-        ("hand_over", "i8"),  # 1: identified parameters become the limits of the adaptive law (3.18)
+        ("sets_targets", "i8"),  # 1: identified parameters become the limits of the adaptive law (3.18)
         ("configured", "f8", PARAMETERS),  # a1..a15 of the cell file
         ("lower", "f8", PARAMETERS),  # configured lower bounds of the parameters that become limits of (3.18)
         ("upper", "f8", PARAMETERS),  # upper bounds

@@ -1,4 +1,4 @@
-"""Charge by the integral of a sampled current, (2.1) of the thesis, and faults of the times: steps back and gaps."""
+"""Charge as the integral of a sampled current, and faults of the timestamps: steps back and gaps."""
 
 import math
 
@@ -11,8 +11,8 @@ from bms_estimator.model.unmeasured_time import MAX_FLOW_S, UNMEASURED_S
 MIN_GAP_PERIODS = 10.0
 """Minimum duration of a gap in multiples of the median sample period."""
 MIN_GAP_TO_LONG_PERIOD = 1.5
-"""Minimum duration of a gap in multiples of the 99th percentile of the sample period. The percentile excludes the longer
-period at which many loggers record rests."""
+"""Minimum duration of a gap in multiples of the 99th percentile of the sample period. Many loggers record rests at a longer period,
+which the percentile includes, so that such steps are no gaps."""
 
 
 class TimeFaults:
@@ -26,7 +26,8 @@ class TimeFaults:
     def __init__(self) -> None:
         self.backward_steps = self.gaps = 0
         self._last_s = math.nan
-        self._first_back_s = self._longest_gap_s = (0.0, 0.0)
+        self._first_back_s = (0.0, 0.0)  # times before and after the step
+        self._longest_gap_s = (0.0, 0.0)  # time of its start, and duration
 
     def add(self, time_s: NDArray[np.float64]) -> None:
         """Add the times of a block."""
@@ -54,7 +55,7 @@ class TimeFaults:
             before_s, after_s = self._first_back_s
             lines.append(
                 f"steps back in time: {self.backward_steps}, the first from {before_s:g} to {after_s:g} s: a clock was set, or "
-                "the test was restarted; samples that are not later than all before are not used"
+                "the test was restarted; a sample is used only if it is later than all before it"
             )
         if self.gaps:
             at_s, longest_s = self._longest_gap_s
@@ -72,7 +73,7 @@ def gap_s(step_s: NDArray[np.float64]) -> float:
     )
 
 
-MIN_END_FRACTION = 0.01
+MIN_LOAD_FRACTION = 0.01
 """Minimum current before or after a gap that counts as a load, as a fraction of the largest current."""
 
 
@@ -120,14 +121,14 @@ def gap_warnings(time_s: Floats, current_a: Floats) -> list[str]:
     finite = np.isfinite(time_s) & np.isfinite(current_a)
     time_s, current_a = time_s[finite], current_a[finite]
     magnitude_a = np.abs(current_a)
-    is_load = magnitude_a > MIN_END_FRACTION * magnitude_a.max(initial=0.0)
+    is_load = magnitude_a > MIN_LOAD_FRACTION * magnitude_a.max(initial=0.0)
     gaps = np.flatnonzero(are_long_gaps(time_s) & (is_load[:-1] | is_load[1:]))
     if not gaps.size:
         return []
     first = int(gaps[0])
     line = (
-        f"the current in gaps of more than an hour is unknown and counts as 0 A: {gaps.size} after or before a load, the first of "
-        f"{time_s[first + 1] - time_s[first]:.0f} s after {time_s[first]:g} s, with {current_a[first]:g} A before and "
+        f"the current in gaps of more than an hour is unknown and counts as 0 A: number of gaps beside a load: {gaps.size}; the first "
+        f"begins at {time_s[first]:g} s and lasts {time_s[first + 1] - time_s[first]:.0f} s, with {current_a[first]:g} A before and "
         f"{current_a[first + 1]:g} A after it"
     )
     return [line]

@@ -14,7 +14,7 @@ PackModel = CellModel | FuelCellModel
 """Model of a pack of batteries or of fuel cell stacks."""
 
 
-def load_any(name_or_path: str | Path, capacity_ah: float | None = None) -> PackModel:
+def load_model(name_or_path: str | Path, capacity_ah: float | None = None) -> PackModel:
     """Load a battery cell (``load_cell``) or a fuel cell (``load_fuel_cell``).
 
     Raises:
@@ -36,7 +36,7 @@ DIGITS = 8
 
 
 def write_cell(path: str | Path, cell: PackModel, remarks: Sequence[str] = ()) -> None:
-    """Write a cell file that ``load_any`` reads.
+    """Write a cell file that ``load_model`` reads.
 
     Args:
         path: Path of the file, which is overwritten if it exists.

@@ -33,7 +33,7 @@ from bms_estimator.pack_model.prior import (
 )
 
 DISCHARGE_C = 0.4
-"""C-rate of a discharge whose charge is not seen. The offset of the current sensor is then an error of the capacity."""
+"""Assumed C-rate of the discharges if charges are not measured. The offset of the current sensor is then an error of the capacity."""
 UNMEASURED_K = 10.0
 """Std of the deviation of an unmeasured temperature from 25 C [K], as for ``noise.UNSENSED_R_STD``."""
 LOW_SOC = 0.1
@@ -53,6 +53,7 @@ class Window:
     full: bool = False
     """True: the end of a charge is seen again and again. The window then ends at SOC 1."""
     charge_seen: bool = True
+    """True: charges are measured, too, so that their balance with the discharges shows the offset of the current sensor."""
     has_temperature: bool = True
     capacity_std: float | None = None
     """Std of ln(true / declared capacity); None: that of the cell file."""
@@ -85,7 +86,7 @@ class Accuracy:
         covariance[SOC, SOC] = NEW_SEGMENT_STD**2
         covariance[LN_Q, LN_Q] = capacity_std**2 + relative_offset**2
         covariance[HYSTERESIS, HYSTERESIS] = 2.0 * HYSTERESIS_STD**2  # fast and slow part are both saturated
-        curve_v2 = curve_covariance(self.cell, self.soc) + 1e-10 * np.eye(self.soc.size)
+        curve_v2 = curve_covariance(self.cell, self.soc) + 1e-10 * np.eye(self.soc.size)  # rounding errors
         if not self.window.has_temperature:
             by_kelvin_v = np.hypot(np.interp(self.soc, SOC_GRID, self.cell.per_kelvin_v), ENTROPY_STD_V)
             curve_v2 += np.outer(UNMEASURED_K * by_kelvin_v, UNMEASURED_K * by_kelvin_v)

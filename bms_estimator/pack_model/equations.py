@@ -85,6 +85,7 @@ class Equations:
         self.intervals = Intervals(cell, rows)
         self.links = Links.of(cell, self.intervals)
         self.u = Unknowns.of(self.intervals.count, self.intervals.segments)
+        """Positions of the unknowns in their vector."""
         self.prior = Prior(cell, self.intervals, self.u)
         self.model = VoltageModel(cell, self.intervals, self.u, reference)
         self.voltage_v = rows["voltage_v"] / cell.series

@@ -204,6 +204,7 @@ def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
     if previous is not None:
         results = starts_near(equations, previous)
         gap_s = rows["gap_s"][rows["segment"] > previous.segment].max(initial=0.0)
+        # the binary exponent grows by 1 when the age doubles
         has_doubled = math.frexp(rows["elapsed_s"][-1])[1] != math.frexp(previous.elapsed_s)[1]
         if not has_doubled and gap_s < equations.model.cell.event_s:
             reach = REACH_SOC + REACH_STD * math.sqrt(previous.covariance[SOC, SOC])

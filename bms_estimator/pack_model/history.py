@@ -1,4 +1,8 @@
-"""History of a pack with a bounded number of rows. Old rows are merged."""
+"""History of a pack with a bounded number of rows. Old rows are merged.
+
+A segment is a time without gaps that may hide a charge. A bank is a pack of several cells in series of which only the sum of the
+voltages is evaluated: its weak cell is found by a comparison with the first discharges (``bank_comparison``).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,12 +23,12 @@ MAX_SEGMENTS = 100
 """Maximum number of segments. Each adds about five unknowns to the fit, whose time grows with the cube of their number: with 100
 segments a fit of 30 days takes four times as long as with one."""
 RECENT_SEGMENTS = MAX_SEGMENTS // 2
-"""Number of segments that are kept before older ones with a known SOC."""
+"""Number of the latest segments that are kept even without a known SOC. Before them, segments with a known SOC take precedence."""
 DAY_S = 86400.0
 """Length of a day [s]."""
 MEAN_FIELDS = ("elapsed_s", "voltage_v", "current_a", "between_a2", "skew_a2", "x_a", "settled_s", "temperature_c", "charge_as",
                "charge_variance_as2", "throughput_soc", "hysteresis", "soc")  # fmt: skip
-"""Fields of which a merged row has the mean, weighted by duration."""
+"""Fields of ``HISTORY_ROW`` of which a merged row has the mean, weighted by duration."""
 OLD_S = 2.0 * DAY_S
 """Age from which on rows are merged [s]."""
 
@@ -35,14 +39,14 @@ class WeakCellTime(NamedTuple):
     start_s: float
     """Time of the first row of the discharge that found the weak cell [s]."""
     end_s: float
-    """Start of the discharge that did not find it [s]; infinite: it is still weak."""
+    """Start of the first later discharge in which no weak cell was found [s]; infinite while the cell is weak."""
     soc: float
     """SOC at which the last discharge found it."""
 
 
 @dataclass(frozen=True)
 class ReferenceDischarges:
-    """Rows of earlier discharges of a bank, and a fit after them."""
+    """Rows of the first discharges of a bank, and the fit that was made after them."""
 
     rows: NDArray[np.void]
     """Shape (n,), dtype HISTORY_ROW. Their field ``soc`` is the fitted SOC."""
@@ -81,7 +85,7 @@ def bounded_segments(rows: NDArray[np.void], first_new: float, capacity_as: floa
     """Return the rows of the ``MAX_SEGMENTS`` segments with the most information.
 
     Segments that neither change nor determine the SOC are dropped first. Then older ones without a known SOC are dropped, because
-    known SOCs determine capacity and offset over a long time. In each group the oldest is the first. The charge of a dropped
+    known SOCs determine capacity and offset over a long time. Within each group the oldest are dropped first. The charge of a dropped
     segment is added to the gap before the next one.
 
     Args:
@@ -112,7 +116,9 @@ def _without_segments(
     rows, sizes = rows.copy(), np.diff(bounds)
     for k in np.flatnonzero(is_dropped[:-1]).tolist():
         first, last, after = rows[bounds[k]], rows[bounds[k + 1] - 1], rows[bounds[k + 1] : bounds[k + 2]]
-        after["charge_as"] += last["charge_as"]
+        after["charge_as"] += last[
+            "charge_as"
+        ]  # the charge of a row counts from before the gap in front of its segment
         after["charge_variance_as2"] += last["charge_variance_as2"]
         after["gap_s"] += last["gap_s"] + last["elapsed_s"] - first["elapsed_s"]
     kept: NDArray[np.void] = rows[~np.repeat(is_dropped, sizes)]
@@ -121,6 +127,7 @@ def _without_segments(
 
 def thin_old_rows(rows: NDArray[np.void], capacity_as: float) -> NDArray[np.void]:
     """Return rows in which those older than ``OLD_S`` are merged to one for each segment, day, SOC bin and direction."""
+    # a row of duration 0 has only a known SOC and is not merged
     is_old = (rows["elapsed_s"] < rows["elapsed_s"][-1] - OLD_S) & (rows["duration_s"] > 0.0)
     old = rows[is_old]
     if old.size == 0:

@@ -229,6 +229,7 @@ class SlowFit:
 
     @property
     def _h(self) -> np.void:
+        """Recording of the history in the estimator's state, a record of HISTORY."""
         record: np.void = self.estimator.record[0]["history"]
         return record
 

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton (Levenberg-Marquardt) minimization of the slow fit's cost."""
+"""Damped Gauss-Newton (Levenberg-Marquardt) minimization of the cost of the slow fit, which fits a model of the pack to weeks of data."""
 
 import threading
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ MAX_ITERATIONS = 30
 MAX_STEP_SOC = 0.15
 """Maximum change of an SOC in one step, because the curves are not linear over a longer one."""
 CONVERGED = 0.02
-"""Decrease of the cost at which the minimization ends."""
+"""The minimization ends when a step lowers the cost by less than this."""
 SAME_COST, SAME_SOC = 0.3, 0.01
 """Differences of cost and SOC below which two minima count as one. They exceed the differences that an unfinished minimization
 leaves (``CONVERGED``)."""
@@ -28,7 +28,8 @@ LESS_DAMPING, MORE_DAMPING = 0.2, 8.0
 """Factors on the damping after a step that lowers the cost, and after a step that does not."""
 
 _ONE_FIT = threading.Lock()
-"""Lock of the number of BLAS threads, which belongs to the process. With two fits at once, the first to end would restore it."""
+"""Lock of the number of BLAS threads, a setting of the process: the first of two concurrent fits to end would restore it under the
+other."""
 
 
 @contextmanager
@@ -75,6 +76,7 @@ def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ())
                 break
     if any(is_same(equations, now, other) for other in known):
         return None
+    # slopes of the fitted correction would count as information on the SOC
     precision = equations.normal_equations(now, use_file_slope=True).a
     return Minimum(now.x, now.cost, cholesky(precision, equations.u.soc.start))
 
@@ -96,11 +98,11 @@ def step(normal: NormalEquations, damping: float, u: Unknowns) -> Floats:
 
 
 def cholesky(a: Floats, sparse: int) -> Floats:
-    """Return the lower Cholesky factor of a matrix whose lower triangle is valid. Its upper triangle is not.
+    """Return the lower Cholesky factor of a symmetric matrix. The upper triangle of the result is meaningless.
 
     Args:
-        a: Matrix; overwritten.
-        sparse: Number of first columns with few non-zero elements.
+        a: Matrix, of which only the lower triangle is read; overwritten.
+        sparse: Number of first columns with few non-zero elements: those of the unknowns of single segments, before the SOCs.
 
     Raises:
         numpy.linalg.LinAlgError: The matrix is not positive definite, or not finite.

@@ -1,4 +1,4 @@
-"""Latest text of each key, and queues of its readers. No I/O.
+"""Latest text of each key, and the readers that wait for new texts.
 
 A slow reader receives only the latest text of each key.
 """

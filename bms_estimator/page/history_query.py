@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.store.history import MINUTE_S
 from bms_estimator.store.history_reader import HistoryReader
 
@@ -53,7 +53,7 @@ class HistoryQuery:
         self._files: dict[str, Path] = {}
         self._cache: dict[tuple[str, str], tuple[float, bytes]] = {}  # read time and JSON, by pack and name of the span
         self._clock = clock
-        self.thread = DiskThread("page")
+        self.thread = DaemonThreadExecutor("page")
 
     def add(self, pack: str, path: Path) -> None:
         """Register the file of a pack's history."""
@@ -76,7 +76,7 @@ class HistoryQuery:
             UserError: The file is missing or cannot be read.
         """
         if pack not in self._files:
-            raise UserError(f"{pack}: there is no history here")
+            raise UserError(f"{pack}: no history is stored for this pack")
         now_s = self._clock()
         cached_s, text = self._cache.get((pack, span), (0.0, b""))
         if not 0.0 <= now_s - cached_s < MAX_CACHE_AGE_S:
@@ -86,6 +86,7 @@ class HistoryQuery:
 
 
 def _query_columns(file: HistoryReader, span: Span, now_s: float) -> bytes:
+    # with a margin, because the samples may have a clock of their own
     since_s, until_s = now_s - span.length_s, now_s + MINUTE_S
     rows = file.rows(since_s, until_s, span.step_s)
     events = file.events(since_s, until_s)[-MAX_EVENTS:]

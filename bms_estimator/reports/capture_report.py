@@ -1,7 +1,4 @@
-"""Report on captures and the model of their cell.
-
-Table of a cell's parameters: cell file, estimates, standard deviations and verdicts.
-"""
+"""Report on captures and the model of their cell, with a table of its parameters, their estimates and a verdict on each."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence

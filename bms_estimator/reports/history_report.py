@@ -1,7 +1,4 @@
-"""Report on a pack's stored history.
-
-Table of a pack's totals and extremes by day.
-"""
+"""Report on a pack's stored history, with a table of totals and extremes by day."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence

@@ -1,6 +1,6 @@
 """Page of a report on captures or on a pack's history: verdict, sections, figures and tables.
 
-Self-contained HTML pages from the Jinja2 templates in ``templates``, without scripts and external resources.
+The HTML is self-contained, without scripts and external resources. It is made from the Jinja2 templates in ``templates``.
 """
 
 from dataclasses import dataclass

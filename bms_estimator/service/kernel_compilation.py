@@ -32,11 +32,11 @@ MAX_CHILD_BYTES = 144 * 2**20
 CHILD_BYTES = 256 * 2**20
 """Available memory for which one child is started [bytes]."""
 MAX_FAILURES = 3
-"""Maximum number of children that end early, for example for lack of memory."""
+"""Number of successive children without a compiled kernel after which compilation is given up, for example for lack of memory."""
 REPORT_S = 0.5
 """Interval between two reports of the progress [s]."""
 COMPLETE_FILE = f"complete-py{sys.version_info[0]}{sys.version_info[1]}-{os.uname().machine}"
-"""File in a folder of compiled kernels that contains all kernels of this version of Python and this architecture."""
+"""Marker file: a folder that has it contains all kernels for this version of Python and this architecture."""
 
 
 class Progress(NamedTuple):

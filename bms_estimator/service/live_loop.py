@@ -21,7 +21,7 @@ from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model.fit import PackFit
-from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.process.signals import acknowledge_on_signal
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.process.systemd import SystemdNotifier
@@ -55,7 +55,7 @@ class FitThread:
     """
 
     def __init__(self, clock: Clock, executor: Executor | None = None) -> None:
-        self._clock, self._executor = clock, executor or DiskThread("fit")  # for its daemon thread
+        self._clock, self._executor = clock, executor or DaemonThreadExecutor("fit")  # for its daemon thread
         self._logged_s: dict[str, float] = {}
         self.times = FitTimes(None, None)
 

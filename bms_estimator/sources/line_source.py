@@ -32,7 +32,10 @@ class SourceUnavailableError(Exception):
 
 
 class LineProducer(ABC):
-    """Producer of sample lines from a device that is not on a serial port. It does all I/O of the source."""
+    """Producer of samples from a device that is not on a serial port. It does all I/O of the source.
+
+    It yields samples as lines of JSON, like a board that prints text, so that one reader serves both.
+    """
 
     @property
     @abstractmethod

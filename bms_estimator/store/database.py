@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 
 import structlog
 
-from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.store.migrations import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
 
 HANG_S = 10.0
@@ -75,7 +75,7 @@ class Database:
     ) -> None:
         self.path, self.reason = path, ""
         self._hang_s, self._retry_s = hang_s, retry_s
-        self._thread = DiskThread("database")
+        self._thread = DaemonThreadExecutor("database")
         self._hung_call: asyncio.Future[Any] | None = None
         self._last_failure_s = -retry_s
         self._shutdown_end_s = math.inf

@@ -1,9 +1,7 @@
 """History of a pack: one-minute rows and events, for the configured number of days.
 
-Four minutes are written in one transaction, and an event at once or ``WRITE_S`` after the previous transaction, outside the
+A row has means, extremes and sums of the publications of a minute. Four minutes are written in one transaction, and an event at once or ``WRITE_S`` after the previous transaction, outside the
 event loop. ``kill -9`` loses the open minute and what is not written yet.
-
-One-minute row of a pack: means, extremes and sums of its publications. No I/O.
 """
 
 import asyncio

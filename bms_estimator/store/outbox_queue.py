@@ -1,9 +1,8 @@
-"""Order of queued messages, in memory and on disk. Pure: no disk, no clock, no task.
+"""Order of queued messages, in memory and on disk. The module itself accesses no disk.
 
 From the oldest to the newest, messages are ``in_flight`` (sent and not acknowledged), ready to be sent, ``stored`` (on
 disk only), or in the tail. New messages enter the tail. While no message is stored, messages are sent from the tail.
-
-Ascending numbers, stored as contiguous ranges. The messages of a day usually form one range. No I/O.
+Messages on disk are listed by their numbers in contiguous ranges, because those of a day usually form one range.
 """
 
 from collections import deque

@@ -28,7 +28,7 @@ CELL_COLUMNS = np.dtype(
         ("cell_r_spread", "f8"),  # highest minus lowest resistance, relative to the median
     ]
 )
-"""Values of a row; NaN before the first estimate of the cells."""
+"""Columns about the cells in a table of estimates; NaN before the first estimate of the cells."""
 
 
 class CellFault(NamedTuple):
@@ -46,7 +46,7 @@ NO_CELL_FAULT = CellFault(0.0)
 
 
 class CellFaults(NamedTuple):
-    """Faults of the cells at one time."""
+    """Inputs of the alarms about the cells at one time, each over all cells."""
 
     at_s: float
     """Time on the samples' clock [s]."""

@@ -12,7 +12,7 @@ from bms_estimator.fleet.packs.pack_type import config_digest
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.pack_model import PackModel, load_any
+from bms_estimator.model.pack_model import PackModel, load_model
 from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.settings.pack import Settings
 
@@ -25,9 +25,9 @@ COULOMB_COUNTING = {"sensor": {"current_sign": "charge_positive"}, "identifier":
 @pytest.mark.parametrize(
     ("settings", "cell", "pack_id", "observer_id", "fleet_digest"),
     [
-        (WITH_IDENTIFIER, load_any("chen_mora"), "5613cbc091ec7ec4", "77ac24e88a0d1f8b", 15431052729970494762),
+        (WITH_IDENTIFIER, load_model("chen_mora"), "5613cbc091ec7ec4", "77ac24e88a0d1f8b", 15431052729970494762),
         (COULOMB_COUNTING, load_cell("leaf").pack(2, 3), "1f291d5895e57362", "06eca6aa573c6d46", 12826646859050909060),
-        ({}, load_any("pem_30w"), "c5d3c64ecb5da3be", "443c82b27a91fe8c", 7172455394262107276),
+        ({}, load_model("pem_30w"), "c5d3c64ecb5da3be", "443c82b27a91fe8c", 7172455394262107276),
     ],
     ids=["chen_mora", "leaf", "pem_30w"],
 )
@@ -49,7 +49,7 @@ def test_the_state_has_the_fields_of_checkpoint_format_7() -> None:
 
 
 def test_a_checkpoint_of_format_7_is_restored(tmp_path: Path) -> None:
-    settings, cell = Settings.model_validate(WITH_IDENTIFIER), load_any("chen_mora")
+    settings, cell = Settings.model_validate(WITH_IDENTIFIER), load_model("chen_mora")
     with np.load(CHECKPOINT_FILE) as file:
         minute_later = BootTimestamp(float(file["wall_s"]) + 60.0, True, 0.0, "another boot")
     files = StateFiles(tmp_path, settings, cell, lambda: minute_later)

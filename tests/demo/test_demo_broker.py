@@ -129,7 +129,7 @@ async def test_will_of_a_client_that_disconnects_is_not_published(port):
 
 async def test_a_port_in_use_is_an_error_but_without_a_given_port_a_free_one_is_used(port):
     async with DemoBroker(port):
-        with pytest.raises(UserError, match=f"port {port}: taken"):
+        with pytest.raises(UserError, match=f"port {port}: in use"):
             DemoBroker(port)
         assert DemoBroker().port != port
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from bms_estimator.demo.true_soc import TrueSoc
+from bms_estimator.demo.true_soc import PackWithSocHistory
 from bms_estimator.model.cell import load_cell
 from bms_estimator.protocols.firmware.messages import MODULUS, SampleMessage
 from bms_estimator.simulation.simulated_pack import SimulatedPack, constant
@@ -25,9 +25,9 @@ def frame(at_s: float) -> bytes:
 
 
 @pytest.fixture
-def truth() -> TrueSoc:
+def truth() -> PackWithSocHistory:
     """Return the recorder of the true SOC of a pack that is simulated for five minutes, before any frame is received."""
-    truth = TrueSoc(SimulatedPack(load_cell("chen_mora"), constant(LOAD_A), soc=START_SOC))
+    truth = PackWithSocHistory(SimulatedPack(load_cell("chen_mora"), constant(LOAD_A), soc=START_SOC))
     for step in range(1, round(300.0 / STEP_S)):
         truth(step * STEP_S)
     return truth
@@ -37,7 +37,9 @@ def soc_at(at_s: float) -> float:
     return START_SOC - FALL_PER_S * at_s
 
 
-def test_true_soc_is_that_of_the_last_complete_sample_although_the_simulation_is_ahead(truth: TrueSoc) -> None:
+def test_true_soc_is_that_of_the_last_complete_sample_although_the_simulation_is_ahead(
+    truth: PackWithSocHistory,
+) -> None:
     assert truth.soc() == START_SOC
     truth.write(0.0, frame(10.0) + frame(60.0))
     assert truth.soc() == pytest.approx(soc_at(60.0), abs=STEP_TOLERANCE)
@@ -48,7 +50,7 @@ def test_true_soc_is_that_of_the_last_complete_sample_although_the_simulation_is
     assert truth.soc() == pytest.approx(soc_at(90.0), abs=STEP_TOLERANCE)
 
 
-def test_noise_on_the_line_does_not_change_the_true_soc(truth: TrueSoc) -> None:
+def test_noise_on_the_line_does_not_change_the_true_soc(truth: PackWithSocHistory) -> None:
     truth.write(0.0, frame(30.0))
     truth.write(0.0, b"\x05noise\0\0\xff" * 9)
     assert truth.soc() == pytest.approx(soc_at(30.0), abs=STEP_TOLERANCE)
@@ -57,7 +59,7 @@ def test_noise_on_the_line_does_not_change_the_true_soc(truth: TrueSoc) -> None:
 def test_true_soc_continues_after_a_wrap_of_the_board_clock() -> None:
     wrap_s = MODULUS * 1e-6
     pack = SimulatedPack(load_cell("chen_mora"), constant(0.01), soc=START_SOC)
-    truth = TrueSoc(pack)
+    truth = PackWithSocHistory(pack)
     for minute in range(1, math.ceil(wrap_s / 60.0) + 20):
         truth(60.0 * minute)
         truth.write(0.0, frame(60.0 * minute))

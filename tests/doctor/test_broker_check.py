@@ -11,7 +11,7 @@ from bms_estimator.doctor.finding import Finding, Level
 from bms_estimator.doctor.subject import Subject
 from tests.doctor.packs import subject
 from tests.free_port import free_port
-from tests.mosquitto import MOSQUITTO, Broker, Listener, closed_broker
+from tests.mosquitto import MOSQUITTO, Broker, Listener, password_broker
 
 READ = "topic read bms/house/request/+\n"
 WRITE = "topic write bms/house/#\n"
@@ -95,7 +95,7 @@ def test_an_unreachable_broker_is_a_fault_unless_there_is_another_one(tmp_path: 
 
 
 def test_a_rejected_login_names_the_settings_of_the_login(tmp_path: Path) -> None:
-    broker = closed_broker(tmp_path)
+    broker = password_broker(tmp_path)
     broker.start()
     try:
         (rejected,) = check_broker(pack_at(tmp_path, broker.url))

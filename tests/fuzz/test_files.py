@@ -15,7 +15,7 @@ from hypothesis.strategies import SearchStrategy
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.pack_model import load_any
+from bms_estimator.model.pack_model import load_model
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.raw_capture import MAGIC
@@ -107,7 +107,7 @@ def test_settings_reader_raises_only_user_errors_that_name_the_file(folder: Path
 
 @edited_seeds("cell", *TOML_TOKENS)
 def test_cell_reader_raises_only_user_errors_that_name_the_file(folder: Path, data: bytes) -> None:
-    load_file(folder / "cell.toml", load_any, data)
+    load_file(folder / "cell.toml", load_model, data)
 
 
 @edited_seeds("csv", b"time_s", b"current_a", b"Voltage / V", b",,", b"\xef\xbb\xbf")

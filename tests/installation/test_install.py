@@ -116,7 +116,7 @@ def test_settings_of_another_pack_are_not_replaced_and_the_error_has_the_command
     pack.write_text(PACK.replace("house", "shed"))
     code, _, err = run(capsys, "install", "--root", root, pack)
     assert code == 2
-    assert "is the pack house" in err
+    assert "has the settings of the pack house" in err
     assert f"sudo install -m 640 -g bms-estimator {pack} /etc/bms-estimator/shed.toml" in err
     assert "sudo systemctl enable --now bms-estimator@shed" in err
     assert (root / "etc/bms-estimator/pack.toml").read_text() == PACK

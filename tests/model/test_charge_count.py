@@ -45,6 +45,9 @@ def test_a_source_with_a_period_of_hours_has_no_gaps() -> None:
 
 def test_a_gap_of_hours_beside_a_load_is_named_with_both_currents() -> None:
     (line,) = gap_warnings(*samples(16_000.0, -0.7, 1.0))
-    assert "1 after or before a load, the first of 16000 s after 100 s, with -0.7 A before and 1 A after it" in line
+    assert (
+        "gaps beside a load: 1; the first begins at 100 s and lasts 16000 s, with -0.7 A before and 1 A after it"
+        in line
+    )
     assert gap_warnings(*samples(16_000.0, 0.0, 0.0)) == []
     assert gap_warnings(*samples(1800.0, -0.7, 1.0)) == []

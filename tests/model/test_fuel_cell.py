@@ -10,7 +10,7 @@ from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.model.cell import is_fuel_cell, load_cell, shipped_fuel_cells
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel, load_fuel_cell
-from bms_estimator.model.pack_model import load_any, write_cell
+from bms_estimator.model.pack_model import load_model, write_cell
 from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")
@@ -60,7 +60,7 @@ def test_a_written_file_is_read_back(tmp_path: Path) -> None:
     a[1 : 1 + len(NAMES)] *= 1.25  # all identified parameters
     identified = PEM.identified(a, {"r_ohm": 0.0123456})
     write_cell(path, identified, ["a remark"])
-    read_back = load_any(path)
+    read_back = load_model(path)
     assert read_back == identified
     assert read_back.a == pytest.approx(a, rel=1e-4)
     assert read_back.std == {"r_ohm": 0.012}  # rounded
@@ -90,7 +90,7 @@ def test_functions_for_batteries_reject_a_fuel_cell(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^pem_30w is a fuel cell, which has no state of charge"):
         load_cell("pem_30w")
     with pytest.raises(UserError, match=r"no capacity"):
-        load_any("pem_30w", 3.0)
+        load_model("pem_30w", 3.0)
     with pytest.raises(UserError, match=r"no such cell file.*pem_30w"):
         load_fuel_cell("pem_31w")
-    assert load_any("chen_mora") == load_cell("chen_mora")
+    assert load_model("chen_mora") == load_cell("chen_mora")

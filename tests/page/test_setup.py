@@ -15,7 +15,7 @@ from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from tests.command_line import run
 from tests.device_line import running_device
-from tests.mosquitto import PASSWORD, closed_broker
+from tests.mosquitto import PASSWORD, password_broker
 from tests.page.chromium import DESKTOP, PHONE, chromium, tab
 from tests.patience import LONG_S
 
@@ -112,7 +112,7 @@ async def page_after(client: ClientSession, server_url: str, path: str, **fields
 
 async def test_a_broker_with_a_password_is_searched_after_a_login(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("bms_estimator.setup.search.LISTEN_S", 0.5)
-    broker = closed_broker(tmp_path).start()
+    broker = password_broker(tmp_path).start()
     login = {"url": broker.url, "username": "owner"}
     try:
         async with SetupServer(loopback(), tmp_path / "pack.toml") as server, ClientSession() as client:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class PublishedCycle(NamedTuple):
-    """Responses of one poll cycle, and their values. The current is positive on discharge."""
+    """Responses of one poll cycle, and their values. The current is positive on discharge, the temperature the mean of the probes."""
 
     protocol: str
     frames: bytes

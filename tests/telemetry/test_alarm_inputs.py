@@ -17,12 +17,12 @@ def change_times_s(present: list[bool], step_s: float, inputs: Inputs) -> list[f
 def inputs_without_temperature() -> Inputs:
     """Return the state of inputs that have lost the temperature."""
     inputs = Inputs(lost_s=10.0, series=2)
-    inputs.restore({"temperature": [1, True]})
+    inputs.restore({"temperature": [1, True]})  # one value per sample, and lost
     return inputs
 
 
 @pytest.mark.parametrize(
-    ("series", "step_s", "restored_s"),
+    ("present", "step_s", "restored_s"),
     [
         ([True] * 100, 1.0, 10.0),
         ([True] * 5, 60.0, 60.0),  # one sample a minute
@@ -31,13 +31,13 @@ def inputs_without_temperature() -> Inputs:
     ],
 )
 def test_a_loss_ends_after_ten_seconds_of_samples_with_values(
-    series: list[bool], step_s: float, restored_s: float
+    present: list[bool], step_s: float, restored_s: float
 ) -> None:
-    assert change_times_s(series, step_s, inputs_without_temperature()) == [restored_s]
+    assert change_times_s(present, step_s, inputs_without_temperature()) == [restored_s]
 
 
 @pytest.mark.parametrize(
-    ("series", "step_s"),
+    ("present", "step_s"),
     [
         ([True] + [False] * 200, 1.0),
         (([True] + [False] * 42) * 50, 0.2),  # a value every 8.6 s
@@ -47,13 +47,14 @@ def test_a_loss_ends_after_ten_seconds_of_samples_with_values(
         ([True] * 9, 1.0),
     ],
 )
-def test_rare_values_do_not_end_a_loss(series: list[bool], step_s: float) -> None:
-    assert change_times_s(series, step_s, inputs_without_temperature()) == []
+def test_values_more_than_five_seconds_apart_do_not_end_a_loss(present: list[bool], step_s: float) -> None:
+    assert change_times_s(present, step_s, inputs_without_temperature()) == []
 
 
 def test_gaps_count_neither_for_a_loss_nor_for_its_end() -> None:
     inputs, one = inputs_without_temperature(), np.ones(50, dtype=np.int64)
     counts = {"voltage": one, "current": one, "cells": one, "temperature": one}
+    # a duration of 0 marks a gap before the sample
     assert inputs.update(100.0 * np.arange(50), np.zeros(50), counts) == []
     assert inputs.lost == ("temperature",)
 
@@ -61,4 +62,5 @@ def test_gaps_count_neither_for_a_loss_nor_for_its_end() -> None:
 def test_state_of_a_pack_with_more_cells_is_restored() -> None:
     inputs = Inputs(lost_s=10.0, series=2)
     inputs.restore({"cells": [16, True]})
+    # the stored number of cells is limited to that of the settings
     assert (inputs.lost, inputs.saved_state) == (("cells",), {"cells": [2, True]})

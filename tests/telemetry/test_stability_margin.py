@@ -8,7 +8,7 @@ from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.pack_model import load_any
+from bms_estimator.model.pack_model import load_model
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
@@ -118,7 +118,7 @@ def test_an_unknown_soc_is_the_reason_for_a_missing_margin() -> None:
 
 
 def test_a_fuel_cell_has_neither_limits_nor_a_margin() -> None:
-    estimator = make_estimator(Settings(), load_any("pem_30w"))
+    estimator = make_estimator(Settings(), load_model("pem_30w"))
     state = published_state(estimator, estimator.run(rest_at(estimator.cell.cell.nominal_voltage_v)))
     assert (state.delta_1, state.delta_configured, state.stability_margin) == (None, False, None)
     assert state.stability_margin_reason is None

@@ -20,7 +20,7 @@ from typing import Any
 
 from bms_estimator.model import clock
 from bms_estimator.process import boot_clock
-from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.telemetry import health
 from tests.world.disk import Disk
 from tests.world.threads import Threads
@@ -98,7 +98,7 @@ def replace_in_package(
         id(random.uniform): dice.uniform,
         id(random.random): dice.random,
         id(ThreadPoolExecutor): lambda *args, **named: threads().executor(*args, **named),
-        id(DiskThread): lambda name: threads().executor(thread_name_prefix=name),
+        id(DaemonThreadExecutor): lambda name: threads().executor(thread_name_prefix=name),
         id(Thread): lambda **named: threads().thread(**named),
         id(sqlite3): _PatchedModule(sqlite3, connect=disk.connect),
         id(secrets.token_hex): lambda count: dice.randbytes(count).hex(),

@@ -109,6 +109,7 @@ def _recognize(capture: Columns, cleaned: CleanCapture, start: StartSoc, cell: C
     good = remove_glitches(capture.rows, capture.name)
     slow = tuple(slow_branches(good, capture.name, start))
     test = None if slow else _relaxation_test(capture, start.soc, cell)
+    # a test whose SOC is unknown, or contradicts the charge: it shows the kind of the capture
     unplaced_test = None if slow or test is not None else _relaxation_test(capture, 1.0, cell)
     if slow:
         kind = " and ".join(branch.label(cell.cell.capacity_ah) for branch in slow)

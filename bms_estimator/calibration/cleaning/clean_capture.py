@@ -15,8 +15,8 @@ from bms_estimator.model.sample import SampleBlock
 
 NEIGHBORS = 2
 """Number of neighbors on each side of a sample. A sample is compared with the median of itself and its neighbors."""
-MIN_SAMPLES = 2 * NEIGHBORS + 1
-"""Minimum number of good samples of a capture."""
+WINDOW_SAMPLES = 2 * NEIGHBORS + 1
+"""Number of samples in the median, and minimum number of good samples of a capture."""
 SPIKE_V = 0.03
 """Maximum deviation of a voltage from its neighbors' median that the current does not explain, per cell [V]."""
 SPIKE_C = 0.1
@@ -24,8 +24,8 @@ SPIKE_C = 0.1
 RESISTANCE_FACTOR = 3.0
 """Largest plausible voltage change per ampere, in multiples of the series resistance at SOC 0.5."""
 UNCHANGED_FRACTION = 0.01
-"""Maximum change of the voltage at a current spike, as a fraction of the change that the largest resistance
-explains."""
+"""A jump of the current is a spike if the voltage changes by less than this fraction of the jump times the largest
+resistance."""
 BLOCK_SAMPLES = 1 << 16
 """Number of samples whose medians are computed at once. It limits the memory of long captures."""
 MIN_GOOD_FRACTION = 0.5
@@ -44,10 +44,11 @@ class CleanCapture:
         voltage_v: Shape (n,), measured [V].
         temperature_c: Shape (n,), temperature of the cell [C]; NaN where it was not measured.
         discharged_ah: Shape (n,), charge drawn since the first sample [Ah].
-        mismatched: Shape (n,), True where voltage and current were of different sides of a step (``are_mismatched``). The current
-            of such a sample counts. Its voltage is that of a neighbor with the same current, and determines no resistance.
+        mismatched: Shape (n,), True where the voltage was measured before a step of the current and the current after it, or vice
+            versa (``are_mismatched``). The current of such a sample counts as charge. Its voltage is replaced by that of a
+            neighbor, and determines no resistance.
         resting_samples: Number of samples at rest before the first load; 0 if the capture starts under load.
-        samples: Number of samples in the capture.
+        samples: Number of samples of the original capture, with glitches.
         glitches: Number of dropped glitches.
     """
 
@@ -110,11 +111,11 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
         raise UserError(
             f"{name}: {good.size} of {samples.size} samples lie within the cell's limits ({limits.voltage_min_v:g} to "
             f"{limits.voltage_max_v:g} V, {limits.current_max_a:g} A); the capture runs from {voltage_v.min():.3f} to "
-            f"{voltage_v.max():.3f} V and {current_a.min():.3f} to {current_a.max():.3f} A: check the cell file and its "
-            "number of cells in series (calibrate, report, validate: --series)"
+            f"{voltage_v.max():.3f} V and {current_a.min():.3f} to {current_a.max():.3f} A: check the cell file and "
+            "the number of cells in series (option --series of calibrate, report and validate)"
         )
-    if good.size < MIN_SAMPLES:
-        raise UserError(f"{name}: {good.size} good samples are too few, at least {MIN_SAMPLES} are needed")
+    if good.size < WINDOW_SAMPLES:
+        raise UserError(f"{name}: {good.size} good samples are too few, at least {WINDOW_SAMPLES} are needed")
     return good
 
 
@@ -133,7 +134,7 @@ def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
 
 def _deviation_from_median(values: Floats) -> Floats:
     """Return each value less the median of the value and its neighbors; 0 at the ends."""
-    windows = np.lib.stride_tricks.sliding_window_view(values, MIN_SAMPLES)
+    windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW_SAMPLES)
     deviation = np.zeros(values.size)
     for begin in range(0, len(windows), BLOCK_SAMPLES):
         medians = np.median(windows[begin : begin + BLOCK_SAMPLES], axis=1)

@@ -18,13 +18,14 @@ MIN_GOOD_FRACTION = 0.5
 """Minimum fraction of good voltages. With fewer, the median may be a glitch, so that glitches are not
 recognized."""
 REST_C_RATE = 0.01
-"""Maximum C-rate of a rest [1/h]. A hundredth of 1 C changes SOC by 0.25 % in a quarter of an hour."""
+"""Maximum C-rate of a rest [1/h]. It changes SOC by only 0.25 % in a rest of 15 min."""
 NOISE_STDS = 6.0
 """Maximum current of a rest, in standard deviations of the current's noise."""
 NOISE_STEP_C_RATE = 0.1
-"""Limit of the change of the current between two samples, below which it counts as noise, as a C-rate [1/h]."""
+"""Changes of the current between two samples below this C-rate [1/h] count as noise, larger ones as load."""
 MIN_LOAD_CHARGE = 2e-5
-"""Minimum charge of a load that interrupts a rest, as a fraction of the capacity. Less is a glitch of the sensor."""
+"""Minimum charge of a load that interrupts a rest, as a fraction of the capacity: 1 C for 72 ms. Less is a glitch of the
+sensor."""
 SOC_SLACK = 0.03
 """Tolerance of the counted SOC outside 0..1, because the capacities of cells of one type differ by as much."""
 
@@ -61,7 +62,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
         first = int(np.argmax(is_earlier))
         raise UserError(
             f"{name}: time goes back {(np.diff(good['time_s']) < 0.0).sum()} times, first from {latest[first]:g} to "
-            f"{good['time_s'][first]:g} s, and {is_earlier.sum()} of {samples.size} samples lie before earlier ones: the file "
+            f"{good['time_s'][first]:g} s, and {is_earlier.sum()} of {samples.size} samples are earlier than one before them: the file "
             "contains several captures, or a clock was set; give each stretch as a file of its own"
         )
     is_later = np.r_[True, good["time_s"][1:] > latest[:-1]]
@@ -76,7 +77,7 @@ def selected(samples: SampleBlock, mask: NDArray[np.bool_]) -> SampleBlock:
 def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:
     """Return SOC at every sample by coulomb counting, (2.1). Shape (n,), not limited to 0..1.
 
-    The charge is that of ``charge_count``.
+    ``charge_ah`` integrates the current, which counts as 0 in gaps of more than an hour.
     """
     return initial_soc - charge_ah(samples["time_s"], samples["current_a"]) / capacity_ah
 
@@ -87,8 +88,8 @@ def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
     time_s = good["time_s"]
     for first, last in true_runs(~resting):
         until_s = time_s[min(last, good.size - 1)]
-        charge_ah = abs(float(good["current_a"][first:last].mean())) * (until_s - time_s[first]) / 3600.0
-        if charge_ah < MIN_LOAD_CHARGE * capacity_ah:
+        load_ah = abs(float(good["current_a"][first:last].mean())) * (until_s - time_s[first]) / 3600.0
+        if load_ah < MIN_LOAD_CHARGE * capacity_ah:
             resting[first:last] = True
     return resting
 

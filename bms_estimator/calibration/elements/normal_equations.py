@@ -166,6 +166,7 @@ def _weights(load: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
     largest_a = float(np.abs(load.current_a).max())
     step_s = np.clip(np.diff(load.time_s, append=load.time_s[-1] + 1.0), 0.0, MAX_ROW_S)
     changed = np.r_[True, np.abs(np.diff(load.current_a)) > STEP_FRACTION * largest_a]
+    # time since the last change: each sample less the latest changed one
     since_s = load.time_s - load.time_s[np.maximum.accumulate(np.where(changed, np.arange(changed.size), 0))]
     weight = step_s / np.maximum(since_s + step_s, MIN_SINCE_STEP_S)
     weight /= weight.sum()

@@ -1,9 +1,7 @@
-"""State machine of a guided test: samples in, instruction and progress out.
+"""State machine of a guided test: samples in; instruction, warnings and progress out.
 
 The test has no clock of its own: all durations are differences of sample times. After a restart, the samples recorded
 before lead to the same state.
-
-Warnings about the current of a guided test, and about the limits of the pack.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Recognition of low-rate discharges and charges in captures, and the capacity by a full one."""
+"""Recognition of low-rate discharges and charges in captures, and the capacity by a complete discharge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,16 +19,17 @@ MIN_DURATION_S = 7.0 * 3600.0
 """Minimum duration of a low-rate curve [s]. A full curve at C/7 takes this long. Faster curves deviate too much from the OCV:
 half of the difference between discharge and charge is already some 20 mV at C/10."""
 MAX_CURRENT_DEVIATION = 0.05
-"""Maximum relative deviation of a constant current from its median, in addition to a standard deviation of its
-noise."""
+"""A current is constant while its deviation from the median is at most this fraction of the median plus one standard
+deviation of its noise."""
 SMOOTH_SAMPLES = 31
 """Length of the median filter [samples]. It removes faults and divides the noise by about five."""
 STD_PER_MEDIAN_STEP = 1.05
 """Standard deviation of white noise over the median absolute difference between its samples."""
 EMPTY_FALL = 0.01
-"""Minimum relative fall of the voltage over the last hundredth of the charge for a discharge that ends empty."""
+"""A discharge ends empty if the voltage falls by more than this fraction of its median while the last 1 % of the charge is
+drawn."""
 MAX_BEFORE_FRACTION = 0.01
-"""Maximum charge drawn before a full discharge, as a fraction of the discharge's charge."""
+"""Maximum net charge drawn, or charged, before a discharge that measures the capacity, as a fraction of its charge."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,13 @@ class SlowBranch:
         voltage_v: Shape (n,), terminal voltage [V].
         current_a: Mean magnitude of the current [A].
         temperature_c: Mean temperature [C]; NaN without a sensor.
-        before_ah: Net charge drawn between the start of the capture and the start of the curve [Ah].
+        before_ah: Net charge drawn between the sample whose SOC is ``start`` and the start of the curve [Ah].
         start_v: Voltage of the rest before the curve [V]; NaN without a rest.
-        step_v: Jump of the voltage when the current starts or stops at the end of the curve at which the cell is full [V]; NaN
+        step_v: Voltage jump at the fuller end of the curve [V]: at the start of a discharge, or at the end of a charge. NaN
             without a rest there.
         to_empty: True for a discharge down to empty.
-        start: SOC at the first sample of the capture; full if the curve itself is a discharge that starts with a full cell.
+        start: SOC at the first sample of the capture. For a discharge that starts with a full cell, it is the SOC at the
+            start of the curve, 1.
     """
 
     name: str
@@ -122,8 +124,10 @@ def _branch(
     elif not charge and first > 0 and resting[first - 1]:
         jump_v = float(good["voltage_v"][first - 1]) - voltage_v[0]
     start_v = float(good["voltage_v"][first - 1]) if first > 0 and resting[first - 1] else float("nan")
-    if not charge and np.fmax(start_v, voltage_v[0]) >= start.full_v and moved_ah[first] <= 0.0:
-        start = replace(start, soc=1.0, origin=StartOrigin.FULL)
+    before_ah = float(moved_ah[first])
+    # after a net discharge, a voltage above full_v does not mean a full cell
+    if not charge and np.fmax(start_v, voltage_v[0]) >= start.full_v and before_ah <= 0.0:
+        start, before_ah = replace(start, soc=1.0, origin=StartOrigin.FULL), 0.0
     # over the last hundredth of the charge, see EMPTY_FALL
     last_fall_v = float(np.interp(0.99 * ah[-1], ah, voltage_v)) - voltage_v[-1]
     return SlowBranch(
@@ -133,7 +137,7 @@ def _branch(
         voltage_v=voltage_v,
         current_a=float(np.abs(part["current_a"]).mean()),
         temperature_c=mean_temperature_c(part),
-        before_ah=float(moved_ah[first]),
+        before_ah=before_ah,
         start_v=start_v,
         step_v=float(np.maximum(jump_v, 0.0)),  # NaN stays NaN
         to_empty=not charge and last_fall_v > EMPTY_FALL * float(np.median(voltage_v)),
@@ -142,7 +146,7 @@ def _branch(
 
 
 def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
-    """Return the capacity by the low-rate discharge down to empty nearest to 25 C [Ah]; NaN without one.
+    """Return the capacity [Ah] by the low-rate discharge down to empty whose temperature is nearest to 25 degC; NaN without one.
 
     Only discharges count that start at a given SOC or with a full cell, because others give a lower bound at most.
     """
@@ -152,7 +156,7 @@ def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
         if branch.to_empty
         and branch.start.is_exact
         and branch.start.soc > 0.0
-        and branch.before_ah < MAX_BEFORE_FRACTION * branch.ah[-1]
+        and abs(branch.before_ah) < MAX_BEFORE_FRACTION * branch.ah[-1]
     ]
     if not known:
         return float("nan")

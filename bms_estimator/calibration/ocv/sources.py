@@ -33,7 +33,7 @@ GIVEN_SYSTEMATIC_V = 2e-3
 """Std of the systematic error of a given curve, per cell [V]."""
 PLATEAU_SYSTEMATIC_V = 0.01
 """Std of the systematic error of a given curve with a plateau, per cell [V]. Such a curve is mostly a quasi-OCV: the mean of a slow
-charge and a slow discharge, or one of both. On the plateau it is beside the rested OCV by part of the hysteresis and of the
+charge and a slow discharge, or one of both. On the plateau it deviates from the rested OCV by part of the hysteresis and of the
 overpotential, and a millivolt is 1 % of SOC."""
 MAX_CAPACITY_DIFFERENCE = 0.05
 """Relative difference between the given and the measured capacity above which a source has a remark."""

@@ -1,14 +1,10 @@
-"""Step 2 of the thesis: run of the adaptive observer over a capture, Algorithm 1 and schemes 1 to 3.
+"""Step 2 of the thesis: run of the adaptive observer over a capture, and the average of its parameters.
 
-Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md.
+Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md. a1..a15 are the coefficients of the elements of Chen and Mora's model as functions of SOC. The observer runs over the
+whole capture by Algorithm 1 or one of schemes 1 to 3. It stops adapting at the SOC below which a capacitance of the model is
+negative (Fig. 19). The result contains "converged" or the reason for a failure.
 
-a1..a15 are the coefficients of the elements of Chen and Mora's model as functions of SOC. The observer runs over the
-whole capture. It stops adapting at the SOC below which a capacitance of the model is negative (Fig. 19). The result
-contains "converged" or the reason for a failure.
-
-Average of the parameters over the settled part of a run, (3.19) of the thesis.
-
-The average begins at the time t_int, when the error has settled, and ends at the time t_unst, when the battery becomes
+The average (3.19) begins at the time t_int, when the error has settled, and ends at the time t_unst, when the model becomes
 unstable. Both times are determined from the run. delta1 (2.11) and delta2 (2.12) are the SOCs below which C_ts and C_tl
 of the model are negative.
 """

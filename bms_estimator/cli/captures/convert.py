@@ -1,8 +1,7 @@
-"""``bms-estimator convert``: a capture in another format.
+"""``bms-estimator convert``: a capture in another format, such as the Battery Data Format (BDF) of the Battery Data Alliance.
 
-Samples in the Battery Data Format (BDF) of the Battery Data Alliance, version 1.2.0 of its ontology.
-
-The header has the preferred labels of the format, such as ``Voltage / V``, which its specification requires in files.
+A BDF file follows version 1.2.0 of the ontology. Its header has the preferred labels, such as ``Voltage / V``, which the
+specification requires in files.
 """
 
 from collections.abc import Callable, Iterator

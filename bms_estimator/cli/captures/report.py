@@ -1,7 +1,4 @@
-"""``bms-estimator report``: HTML page on captures and their cell's model, or on a pack's history.
-
-Stored history of a pack for a report.
-"""
+"""``bms-estimator report``: HTML page on captures and their cell's model, or on the stored history of a pack."""
 
 import time
 from collections.abc import Sequence

@@ -1,9 +1,4 @@
-"""Calibration beside a pack: reads samples, shows the instructions of a guided test, and switches the load.
-
-Screen of a calibration beside a pack: instruction, progress, and the voltages of the rests over SOC. No I/O.
-
-Limits of a pack in a guided test, from its settings and alarms.
-"""
+"""Calibration beside a pack: reads samples, shows the screen of a guided test, and switches the load within the pack's limits."""
 
 import asyncio
 import math

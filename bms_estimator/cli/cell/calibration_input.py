@@ -19,7 +19,7 @@ from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 @dataclass(frozen=True)
 class GivenCell:
-    """Cell with the rated capacity, and its arrangement in the captures.
+    """Cell given by the user, and the arrangement of such cells in the measured pack.
 
     Attributes:
         cell: One cell.

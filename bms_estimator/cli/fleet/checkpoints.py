@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer
 
-DAY_COLUMNS = ("day", "partitions", "MB")
+DAY_COLUMNS: tuple[str, ...] = ("day", "partitions", "MB")
 COLUMNS = ("kind", "written (UTC)", "sequence", "format", "increments", "MB")
 
 app = typer.Typer(
@@ -37,10 +37,11 @@ def list_checkpoints(
     """Print the days with daily checkpoints and their number of partitions, or all checkpoints of one partition."""
     pointers = asyncio.run(_read((server, creds, ca)))
     if partition is None:
-        print_table(DAY_COLUMNS, _day_rows(pointers.values()))
-    elif partition in pointers:
-        print_table(COLUMNS, _rows(pointers[partition]))
-    if not any(pointer.daily for number, pointer in pointers.items() if partition in (None, number)):
+        columns, rows = DAY_COLUMNS, _day_rows(pointers.values())
+    else:
+        columns, rows = COLUMNS, _rows(pointers[partition]) if partition in pointers else []
+    print_table(columns, rows)
+    if not rows:
         typer.echo("none")
 
 
@@ -57,7 +58,7 @@ def restore(
     creds: Creds = None,
     ca: Ca = None,
 ) -> None:
-    """Return all packs of partitions to the first checkpoint of a day.
+    """Reset all packs of the chosen partitions to the first checkpoint of a day.
 
     The workers then process the later blocks that are still in the stream again. If wrong samples have spoiled the states, use
     --skip-blocks.

@@ -1,6 +1,6 @@
 """Captures as arguments of a command: files or standard input. Guesses about their format are printed on stderr.
 
-Capture from a pipe, copied to a file because readers need a file's size and read it twice.
+Standard input is copied to a file, because readers need the size of a file and read it twice.
 """
 
 import shutil

@@ -8,7 +8,7 @@ from bms_estimator.model.cell import CellModel, generic_cells, load_cell
 from bms_estimator.model.config_file import error_reason, without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.model.pack_model import PackModel, load_any
+from bms_estimator.model.pack_model import PackModel, load_model
 from bms_estimator.protocols.base.device import BMS_GAIN_STD
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import PackSettings, Settings, load_settings
@@ -77,7 +77,7 @@ def _locate_cell(pack: Path, cell: str) -> str:
 
 def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
     """Return the model of the whole pack, built from ``cell``."""
-    model = load_any(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
+    model = load_model(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
     if settings.pack.initial_soc is not None:
         reject_soc_for_fuel_cell(model, "pack.initial_soc")
     return model

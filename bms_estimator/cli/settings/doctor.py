@@ -70,7 +70,7 @@ def doctor(
 
 def _examine(path: Path) -> Iterator[Finding]:
     """Yield the findings on a pack and the machine. If the settings are invalid, yield only findings on the machine."""
-    subject = load_subject(path)
+    subject = load_examined_settings(path)
     if isinstance(subject, Finding):
         yield subject
         yield from examine(None)
@@ -80,7 +80,7 @@ def _examine(path: Path) -> Iterator[Finding]:
         yield from examine(subject)
 
 
-def load_subject(path: Path) -> Subject | Finding:
+def load_examined_settings(path: Path) -> Subject | Finding:
     """Return the pack and its service, or a finding if the settings cannot be used."""
     try:
         settings, model = load_pack(path)

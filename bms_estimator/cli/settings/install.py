@@ -48,7 +48,7 @@ def install_command(
     program = _program(machine)
     with _errors_of_files():
         may_start = install(machine, program, files, _report)
-    if machine.is_running and not no_start:
+    if machine.has_running_systemd and not no_start:
         if may_start:
             compile_ahead(program)
             start()

@@ -161,6 +161,7 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
         StreamError: The server does not respond, or has no such stream.
     """
     capture = BlockCapture(since_s, until_s)
+    # -inf, the default, is no date; None: from the first message on
     first_s = None if since_s <= AHEAD_S else since_s - AHEAD_S
     async for batch in read_stream(nc, RAW_STREAM, f"p.*.raw.{pack}", since_s=first_s):
         for message in batch:

@@ -26,7 +26,7 @@ class BucketReader:
         self._nc, self._bucket = nc, bucket
         self._next_sequence = 1
         self._created: object = None  # creation time of the stream with this sequence number
-        self._keys = set[str]()  # also those whose removal is marked
+        self._keys = set[str]()  # also removed keys, which have a deletion marker
         self.lost = set[str]()
 
     async def read(self, set_value: Callable[[str, bytes | None], object]) -> None:
@@ -41,7 +41,7 @@ class BucketReader:
             info = await self._nc.jetstream().stream_info(stream_of(self._bucket))
         except nats.errors.Error as error:
             raise StreamError(f"the server rejects reading {stream_of(self._bucket)}: {error_text(error)}") from None
-        # another bucket of this name uses the numbers again
+        # a new bucket of the same name numbers its messages from 1 again
         is_other = info.created != self._created or info.state.last_seq + 1 < self._next_sequence
         is_purged = not is_other and info.state.messages < len(self._keys)
         first = 1 if is_other or is_purged else self._next_sequence

@@ -1,4 +1,4 @@
-"""Pointer to the checkpoints of a partition: the entry of the bucket ``checkpoints``."""
+"""Pointer of a partition, an entry of the bucket ``checkpoints``: a list of its checkpoints, which are in the object store."""
 
 from pydantic import BaseModel, ConfigDict
 
@@ -30,7 +30,7 @@ class CheckpointInfo(BaseModel):
 
 
 class Pointer(BaseModel):
-    """Entry of a partition in the checkpoint bucket."""
+    """List of a partition's checkpoints, and the claim of the worker that owns the partition."""
 
     model_config = ConfigDict(frozen=True)
 

@@ -12,7 +12,7 @@ from bms_estimator.fleet.nats.streams import (
     HOURS_FRACTION,
     MAX_BLOCK_BYTES,
     PACK_FRACTION,
-    pack_blocks,
+    max_blocks_of_pack,
 )
 
 DAY_S = 86_400
@@ -93,7 +93,7 @@ def stream_sizes(packs: int, outage_days: float, cells: int = 0, block_s: float 
         raw_bytes,
         states=max(states_bytes, MIN_STATES_BYTES),
         history=packs * HISTORY_BYTES,
-        pack_blocks=max(pack_blocks(raw_bytes), math.ceil(outage_blocks)),
+        pack_blocks=max(max_blocks_of_pack(raw_bytes), math.ceil(outage_blocks)),
     )
 
 

@@ -51,7 +51,7 @@ async def read_snapshot(nc: Client, stream: str, write: Callable[[bytes], object
         write: Receives the chunks of the snapshot.
 
     Raises:
-        StreamError: The server does not respond, has no such stream, or breaks the snapshot off.
+        StreamError: The server does not respond, has no such stream, or aborts the snapshot.
     """
     inbox = nc.new_inbox()
     chunks = await nc.subscribe(inbox, pending_msgs_limit=-1, pending_bytes_limit=-1)
@@ -71,9 +71,7 @@ async def read_snapshot(nc: Client, stream: str, write: Callable[[bytes], object
         await chunks.unsubscribe()
     headers = chunk.headers or {}
     if headers.get("Status", COMPLETE) != COMPLETE:
-        raise StreamError(
-            f"{stream}: the server breaks the snapshot off: {headers.get('Description', headers['Status'])}"
-        )
+        raise StreamError(f"{stream}: the server aborts the snapshot: {headers.get('Description', headers['Status'])}")
     return info
 
 

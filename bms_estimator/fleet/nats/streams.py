@@ -1,6 +1,6 @@
 """Streams, buckets and consumers of one tenant.
 
-``RAW`` stores the blocks of edges in partitions. Each partition has a durable consumer, which the server pins to one worker at
+The stream ``RAW`` stores the blocks of samples that edges send, divided into partitions by pack. Each partition has a durable consumer, which the server pins to one worker at
 a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object buckets are streams with the
 configuration that all clients give them (ADR-8, ADR-20).
 """
@@ -26,28 +26,31 @@ RAW_BYTES = 8 << 30
 RAW_AGE_S = 7 * 86_400.0
 """Default maximum age of a message in the stream ``RAW`` [s]."""
 UNLIMITED = -1
-"""Size of a stream that only the server's disk space limits."""
+"""Value of ``max_bytes`` that leaves a stream limited by the server's disk space only."""
 HOURS_FRACTION = 1 / 16
-"""Maximum size of the stream ``HOURS`` as a fraction of the maximum size of ``RAW``."""
+"""Maximum size of the stream ``HOURS`` of hourly summaries, as a fraction of the maximum size of ``RAW``. If minute blocks of seven
+days fill ``RAW``, it holds the summaries of eleven days."""
 HOURS_AGE_S = 30 * 86_400.0
 """Maximum age of a message in the stream ``HOURS`` [s]."""
 DEAD_FRACTION = 1 / 64
-"""Maximum size of the stream ``DEAD`` as a fraction of the maximum size of ``RAW``."""
+"""Maximum size of the stream ``DEAD`` of dead letters, as a fraction of the maximum size of ``RAW``: 512 of the largest blocks by
+default."""
 DEAD_AGE_S = 30 * 86_400.0
 """Maximum age of a message in the stream ``DEAD`` [s]."""
 MAX_BLOCK_BYTES = 256 << 10
 """Maximum size of a block in ``RAW`` [bytes]: 7,000 incompressible samples."""
 MAX_BATCH_BYTES = (1 << 20) - (16 << 10)
-"""Maximum size of a batch in ``TELEMETRY`` [bytes], so that its dead letter with the reason fits a message of the server."""
+"""Maximum size of a batch in ``TELEMETRY`` [bytes]: the server's limit of a message, 1 MiB, less 16 KiB for the reason with which
+``DEAD`` stores a rejected batch."""
 PACK_FRACTION = 1 / 3
 """Fraction of ``RAW`` that one pack can fill with blocks of the maximum size. Beyond this fraction, the pack's oldest
 block is removed. By default the fraction corresponds to seven days of minute blocks."""
 MIN_PACK_BLOCKS = 60
 """Minimum number of stored blocks of a pack, even in a small ``RAW``: an hour of minute blocks."""
 DUPLICATES_S = 3600.0
-"""Time within which the server drops a summary with a repeated message id [s]."""
+"""Time within which the server drops a message of ``HOURS`` or ``HISTORY`` whose id it has already seen [s]."""
 HISTORY_PACK_MESSAGES = 500
-"""Maximum number of stored messages of a pack in ``HISTORY``: 6,000 rows, more than a history has."""
+"""Maximum number of stored messages of a pack in ``HISTORY``. With 12 rows each they exceed the 5,000 rows of a history."""
 GROUP = "w"
 """Priority group of the consumers."""
 PIN_S = 2.0
@@ -87,9 +90,10 @@ async def make_streams(
         replicas: Number of replicas: 1, or 3 in a cluster of three.
         raw_bytes: Maximum size of ``RAW`` [bytes]; beyond it the oldest messages are dropped.
         raw_age_s: Maximum age of messages in ``RAW`` [s].
-        states_bytes: Maximum size of the checkpoints [bytes]; beyond it the workers remove daily ones.
+        states_bytes: Maximum size of the bucket ``states``, which contains the checkpoints [bytes]; beyond it the workers remove
+            daily ones.
         history_bytes: Maximum size of the histories [bytes]; beyond it the oldest messages are dropped.
-        max_pack_blocks: Maximum number of blocks of one pack in ``RAW``; default: ``pack_blocks``.
+        max_pack_blocks: Maximum number of blocks of one pack in ``RAW``; default: ``max_blocks_of_pack``.
 
     Raises:
         UserError: The streams have another number of partitions, or the server has too little disk space.
@@ -99,10 +103,10 @@ async def make_streams(
     if existing not in (None, partitions):
         raise UserError(
             f"the stream {subjects.RAW_STREAM} has {existing} partitions, but {partitions} are configured: "
-            "the number of a stream cannot change"
+            "the number of partitions of an existing stream cannot change"
         )
     streams = (
-        _raw_stream(partitions, raw_bytes, raw_age_s, max_pack_blocks or pack_blocks(raw_bytes)),
+        _raw_stream(partitions, raw_bytes, raw_age_s, max_pack_blocks or max_blocks_of_pack(raw_bytes)),
         _hours_stream(raw_bytes),
         _dead_stream(raw_bytes),
         *_fit_streams(history_bytes),
@@ -124,6 +128,7 @@ async def partitions_of(nc: Client) -> int | None:
         if response["error"].get("err_code") == NO_SUCH_STREAM:
             return None
         raise _rejection(subjects.RAW_STREAM, response)
+    # a stream that an early version created has no such key
     return int(response["config"].get("metadata", {}).get(PARTITIONS_KEY, subjects.PARTITIONS))
 
 
@@ -165,7 +170,7 @@ def consumer(partition: int) -> str:
     return f"p{partition}"
 
 
-def pack_blocks(raw_bytes: int) -> int:
+def max_blocks_of_pack(raw_bytes: int) -> int:
     """Return the maximum number of blocks of one pack in ``RAW``."""
     return max(round(PACK_FRACTION * raw_bytes / MAX_BLOCK_BYTES), MIN_PACK_BLOCKS)
 
@@ -183,6 +188,7 @@ def _raw_stream(partitions: int, max_bytes: int, age_s: float, max_pack_blocks: 
     return _stream(
         subjects.RAW_STREAM,
         subjects.raw("*"),
+        # changes of the table and fits are stored here, too, so that a worker processes them in order with the blocks
         subjects.table_change(),
         subjects.fit(),
         subject_transform={"src": source, "dest": destination},
@@ -213,7 +219,7 @@ def _dead_stream(raw_bytes: int) -> dict[str, Any]:
 
 
 def _fit_streams(history_bytes: int) -> list[dict[str, Any]]:
-    """Return the streams of the histories, and of the requests for fits, of which each pack has one at most."""
+    """Return the streams of histories and of requests for fits. A pack has at most one waiting request."""
     history = {
         "max_bytes": history_bytes,
         "max_msgs_per_subject": HISTORY_PACK_MESSAGES,
@@ -257,7 +263,7 @@ async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
     config = {
         "durable_name": name,
         "filter_subject": subjects.stored(partition),
-        "ack_policy": "none",
+        "ack_policy": "none",  # a worker continues after the last message that its checkpoint includes
         "priority_groups": [GROUP],
         "priority_policy": "pinned_client",
         "priority_timeout": _ns(PIN_S),
@@ -298,6 +304,7 @@ async def _request(nc: Client, operation: str, request: dict[str, Any]) -> dict[
 
 
 def _rejection(name: str, response: dict[str, Any]) -> TemporaryError:
+    """Return the error of a rejected request. It is temporary, because the server may lack disk space for a time."""
     return TemporaryError(
         f"the server rejects the stream {name}: {response['error'].get('description', response['error'])}"
     )

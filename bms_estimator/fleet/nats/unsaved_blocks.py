@@ -20,9 +20,9 @@ from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
 WARNING_SHARE = 0.5
 """Share above which operators are warned."""
 MIN_BLOCK_S = 1.0
-"""Minimum duration of a block [s], from which the shortest time follows in which a pack reaches its limit of blocks."""
+"""Minimum duration of a block [s]. A pack reaches its limit of N stored blocks after N times this duration at the earliest."""
 MAX_CHECKED_PACKS = 3
-"""Number of packs of a partition with the most blocks that are checked for their limit."""
+"""Number of packs that are checked in each partition: those with the most stored blocks."""
 
 
 class Unsaved(NamedTuple):
@@ -84,13 +84,13 @@ async def unsaved_blocks(nc: Client, partitions: Iterable[int]) -> Unsaved:
     max_bytes, max_age_s = raw.config.max_bytes or 0, raw.config.max_age or 0.0
     by_size = unsaved_bytes / max_bytes if max_bytes > 0 else 0.0
     by_age = (now_s - oldest_s) / max_age_s if max_age_s > 0.0 else 0.0
-    return max(Unsaved(min(1.0, max(by_size, by_age))), of_pack)
+    return max(Unsaved(min(1.0, max(by_size, by_age))), of_pack)  # compared by their shares
 
 
 async def _unsaved_of_packs(js: JetStreamContext, partition: int, first: int, max_blocks: int) -> Unsaved:
     """Return the largest unsaved share of a pack's limit in a partition.
 
-    The number of the unsaved blocks follows from their time, as a part of the time of all blocks of the pack.
+    The number of unsaved blocks is estimated by the fraction of the pack's time span that they cover.
 
     Args:
         js: JetStream of the tenant.

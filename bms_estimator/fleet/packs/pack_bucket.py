@@ -67,11 +67,11 @@ class PackBucket:
         return changed
 
     async def _read(self, bucket: str, set_value: Callable[[str, bytes | None], bool]) -> None:
-        def set_changed(key: str, data: bytes | None) -> None:
+        def set_and_record(key: str, data: bytes | None) -> None:
             if set_value(key, data):
                 self._changed[bucket].add(key)
 
-        await self._readers[bucket].read(set_changed)
+        await self._readers[bucket].read(set_and_record)
 
     async def follow(self, changed: Callable[[set[str]], None]) -> None:
         """Poll for changes until cancelled; call ``changed`` with the packs whose row or cell has changed.
@@ -157,7 +157,7 @@ async def remove_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
 
 
 async def purge_keys(nc: Client, bucket: str, keys: Collection[str]) -> None:
-    """Remove keys and the marks of their removal from a bucket. Readers of the bucket then read it from its beginning.
+    """Remove keys and their deletion markers from a bucket. Readers of the bucket then read it from its beginning.
 
     Raises:
         nats.js.errors.APIError: The server rejects the request.

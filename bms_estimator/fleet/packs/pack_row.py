@@ -20,7 +20,7 @@ from bms_estimator.model.config_file import NotNegative, Positive, Strict, error
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.one_of import OneOf
-from bms_estimator.model.pack_model import PackModel, load_any
+from bms_estimator.model.pack_model import PackModel, load_model
 from bms_estimator.protocols.registry import DEVICES
 from bms_estimator.settings.observer import IdentifierSettings, IdentifierValues
 from bms_estimator.settings.pack import DeviceName, PackSettings, PackValues, Settings
@@ -35,7 +35,7 @@ _SECTIONS: dict[str, type[Strict]] = {"pack": PackSettings, "sensor": SensorSett
 
 
 class _CellName(Strict):
-    """First column of a specification."""
+    """Field ``cell``. It is in a base class of its own, the last one, because pydantic lists the fields of the last base first."""
 
     cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
         description="generic chemistry lfp, nmc, nca, lco, lmo or lto (with capacity_ah), shipped cell, or cell file "
@@ -46,7 +46,7 @@ class _CellName(Strict):
 class PackSpec(IdentifierValues, PackValues, _CellName):
     """Specification that many packs share: values of the sections ``[pack]``, ``[identifier]`` and ``[sensor]`` of a settings file.
 
-    The section ``[sensor]`` has its own columns, because their defaults are those of ``protocol``.
+    The columns of ``[sensor]`` are declared here and not inherited, because their defaults depend on ``protocol``.
     """
 
     protocol: Annotated[str, OneOf(DEVICES)] = Field(
@@ -128,7 +128,8 @@ def model_of(spec: PackSpec, cell_file: str | None) -> PackModel:
 
     Args:
         spec: Specification of the pack.
-        cell_file: Text of the loaded file with the cell's name; None without one. A shipped cell takes precedence.
+        cell_file: Text of the cell file that was uploaded under the name ``spec.cell``; None without one. A shipped cell takes
+            precedence.
 
     Raises:
         UserError: The cell is missing or invalid, or the capacity is missing or not allowed.
@@ -142,13 +143,13 @@ def model_key(spec: PackSpec) -> tuple[object, ...]:
 
 
 def cell_of(spec: PackSpec, cell_file: str | None) -> PackModel:
-    """Return the model of one cell-file object of a pack. Arguments and errors are those of ``model_of``."""
+    """Return the model in the cell file of a pack, before it is multiplied by ``series`` and ``parallel``; see ``model_of``."""
     name = spec.cell
     if name in known_cells():
-        return load_any(name, spec.capacity_ah)
+        return load_model(name, spec.capacity_ah)
     if cell_file is None:
         raise UserError(
-            f"{name}: no cell file of this name was loaded, and the package's are {', '.join(known_cells())}"
+            f"{name}: no cell file of this name was uploaded, and it is none of the shipped cells {', '.join(known_cells())}"
         )
     if not _is_fuel_cell(cell_file):
         cell = parse_toml(cell_file, CellModel, f"cell {name}")

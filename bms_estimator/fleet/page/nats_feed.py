@@ -148,7 +148,7 @@ class FleetFeed:
             view.workers.partitions = await partitions_of(nc) or view.workers.partitions
             for pack in await bucket.refresh():
                 spec = bucket.packs.parsed_row(pack)
-                view.set_type(pack, None if spec is None else type_name(spec))
+                view.set_pack_type(pack, None if spec is None else type_name(spec))
             view.dead_packs = await dead_packs.read()
 
         while True:

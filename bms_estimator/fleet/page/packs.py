@@ -144,7 +144,7 @@ class FleetPacks:
 
         Returns:
             ``packs`` (counts), ``types`` (number and distribution of each), ``soc_std_edges`` (histogram edges; the last bin
-            is open), ``concerns`` (number of packs and worst packs of each concern), ``attention`` (number of packs with
+            is open), ``concerns`` (number of packs and worst packs of each concern), ``attention_count`` (number of packs with
             any concern).
         """
         rows = self._rows[: len(self._names)]
@@ -204,7 +204,7 @@ class FleetPacks:
             "count": int(silent.sum()),
             "packs": [[self._names[i], _age_s(heard, now_s)] for i, heard in _extremes(rows["heard_s"], silent)],
         }
-        return {"concerns": concerns, "attention": int(attention.sum())}
+        return {"concerns": concerns, "attention_count": int(attention.sum())}
 
 
 def _fault_names(suspects: int) -> str:

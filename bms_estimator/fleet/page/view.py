@@ -1,4 +1,4 @@
-"""Overview of a fleet for its page. The clocks are arguments."""
+"""Overview of a fleet for its page. No function reads a clock; the time is an argument."""
 
 import json
 from collections import deque
@@ -13,7 +13,7 @@ from bms_estimator.fleet.page.packs import MAX_LISTED, FleetPacks
 from bms_estimator.model.clock import iso_utc
 
 MAX_UNKNOWN = 1000
-"""Maximum number of unknown packs whose reasons are stored."""
+"""Maximum number of packs missing from the table for which the reason is stored."""
 
 
 class FleetView:
@@ -30,7 +30,7 @@ class FleetView:
         """Packs with dead letters."""
         self._unknown: dict[str, str] = {}
         self._since_s = now_s
-        self._state_counts = deque([(now_s, 0)])
+        self._received_counts = deque([(now_s, 0)])  # time, and number of states received until then
         self.listening = False
         """True while connected to the server; otherwise the values are outdated."""
         self.damaged = 0
@@ -60,8 +60,8 @@ class FleetView:
         if len(self._unknown) > MAX_UNKNOWN:
             del self._unknown[next(iter(self._unknown))]
 
-    def set_type(self, name: str, type_name: str | None) -> None:
-        """Set the type of a pack in the table; None removes it."""
+    def set_pack_type(self, name: str, type_name: str | None) -> None:
+        """Add a pack of the table, or change its type, such as "lfp 4s1p". None: the pack was removed from the table."""
         self.packs.list_pack(name, type_name)
         if type_name is not None:
             self._unknown.pop(name, None)
@@ -76,7 +76,7 @@ class FleetView:
         result["concerns"]["unknown"] = unknown = self._unknown_packs(now_s)
         result["concerns"]["clock"] = clock = self._packs_with_clock_error(now_s)
         result["concerns"]["dead"] = {"count": self.dead_packs.packs, "packs": self.dead_packs.reasons[:MAX_LISTED]}
-        result["attention"] += unknown["count"] + clock["count"] + self.dead_packs.packs
+        result["attention_count"] += unknown["count"] + clock["count"] + self.dead_packs.packs
         return result | {
             "time": iso_utc(wall_s),
             "listening_s": round(now_s - self._since_s, 1),
@@ -86,10 +86,10 @@ class FleetView:
 
     def _rate(self, now_s: float) -> float | None:
         """Return the recent rate of states [1/s]."""
-        self._state_counts.append((now_s, self.packs.states))
-        while len(self._state_counts) > 2 and self._state_counts[1][0] <= now_s - RATE_S:
-            self._state_counts.popleft()
-        before_s, states = self._state_counts[0]
+        self._received_counts.append((now_s, self.packs.states))
+        while len(self._received_counts) > 2 and self._received_counts[1][0] <= now_s - RATE_S:
+            self._received_counts.popleft()
+        before_s, states = self._received_counts[0]
         return (self.packs.states - states) / (now_s - before_s) if now_s > before_s else None
 
     def _packs_with_clock_error(self, now_s: float) -> dict[str, Any]:

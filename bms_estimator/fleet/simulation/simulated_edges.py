@@ -43,7 +43,7 @@ class SimulatedEdges:
     def __init__(self, fleet: SimulatedFleet, *, start_s: float, speed: float, last: int | None = None) -> None:
         self._fleet, self._start_s, self._speed, self.last = fleet, start_s, speed, last
         self._index = {name: i for i, name in enumerate(fleet.names)}
-        self._store_offset_s = (fleet.store - fleet.begin_ns) / 1e9
+        self._store_offset_s = (fleet.store_created_ns - fleet.begin_ns) / 1e9
         self.next_number: Whole = np.ones(len(fleet.names), dtype=np.int64)
         self.confirmed_below = self.next_number.copy()
         self._first_unsent = self.next_number.copy()  # lowest number that each edge has never sent
@@ -68,7 +68,7 @@ class SimulatedEdges:
     def receive_reply(self, pack: str, reply: BlockRequest, now_s: float) -> bool:
         """Process a worker's reply. Return False if the reply is for another fleet's pack or store."""
         i = self._index.get(pack)
-        if i is None or reply.store != self._fleet.store[i]:
+        if i is None or reply.store != self._fleet.store_created_ns[i]:
             return False
         number = self.confirmed_below[i] = max(self.confirmed_below[i], reply.number)
         if reply.resend:

@@ -168,7 +168,7 @@ class SimulatedFleet:
         self._kind_index = pack % len(KINDS)
         store_delay_s = self._uniform(pack, _Draw.STORE_DELAY) * BLOCK_S
         self.begin_ns = begin_ns
-        self.store: Whole = begin_ns + (store_delay_s * 1e9).astype(np.int64)
+        self.store_created_ns: Whole = begin_ns + (store_delay_s * 1e9).astype(np.int64)
         self._omega = 2.0 * math.pi / (MIN_PERIOD_S + (MAX_PERIOD_S - MIN_PERIOD_S) * self._uniform(pack, _Draw.PERIOD))
         self._phase = 2.0 * math.pi * self._uniform(pack, _Draw.PHASE)
         self._temperature_c = np.round(20.0 + 10.0 * self._uniform(pack, _Draw.TEMPERATURE), 1)
@@ -198,7 +198,7 @@ class SimulatedFleet:
         samples = self.samples(packs, numbers)
         for i, (pack, number) in enumerate(zip(packs.tolist(), numbers.tolist(), strict=True)):
             block = Block(
-                store_created_ns=int(self.store[pack]),
+                store_created_ns=int(self.store_created_ns[pack]),
                 number=number,
                 oldest=1,
                 arrival_s=float(arrival_s[i]),

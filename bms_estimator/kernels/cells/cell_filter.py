@@ -113,8 +113,8 @@ def predict_cell(c: Record, b: Record, balancing_variance: float) -> None:
 
 
 @njit(cache=True)
-def deviation_v(c: Record, p: Record, soc: float, drop_v: float) -> tuple[float, float]:
-    """Return the predicted deviation of a cell's voltage, and its derivative by the cell's SOC [V].
+def deviation_and_slope(c: Record, p: Record, soc: float, drop_v: float) -> tuple[float, float]:
+    """Return the predicted deviation of a cell's voltage from that of the reference cell, and its derivative by the cell's SOC [V].
 
     Args:
         c: The cell.
@@ -188,9 +188,10 @@ def pack_range_v(c: Record, p: Record, soc: float, soc_std: float) -> float:
     At the end of a charge of LFP, the deviation of the voltage grows tenfold within a few percent of SOC.
     """
     half = CURVE_STDS * math.sqrt(soc_std**2 + KNEE_SOC**2)
-    middle_v = deviation_v(c, p, soc, 0.0)[0]
+    middle_v = deviation_and_slope(c, p, soc, 0.0)[0]
     return max(
-        abs(deviation_v(c, p, soc + half, 0.0)[0] - middle_v), abs(deviation_v(c, p, soc - half, 0.0)[0] - middle_v)
+        abs(deviation_and_slope(c, p, soc + half, 0.0)[0] - middle_v),
+        abs(deviation_and_slope(c, p, soc - half, 0.0)[0] - middle_v),
     )
 
 

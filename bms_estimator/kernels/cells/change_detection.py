@@ -1,9 +1,10 @@
 """Detection of changes that the filter of a cell does not expect: generalized likelihood ratios of its innovations.
 
 A. Willsky and H. Jones, "A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems",
-IEEE Transactions on Automatic Control 21 (1976), pages 108-112. ``response`` is the error of the filter's state
-if a change by 1 began at the restart of the hypothesis. The innovations are white under the filter's own model. ``score`` over the root of ``information``
-therefore has a standard normal distribution without a change, so that the threshold needs no training.
+IEEE Transactions on Automatic Control 21 (1976), pages 108-112. The hypotheses are RISE and FALL of the self-discharge, and DRAIN by a
+balancer. ``response`` is the error that the filter's state would have, had a change of size 1 begun at the last restart of the
+hypothesis. Without a change, the innovations are white, and ``score`` over the root of ``information`` has a standard normal
+distribution, so that the threshold needs no training.
 
 ``c`` is a record of CELL, ``b`` of BANK.
 """
@@ -16,7 +17,8 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 MIN_CHANGE_C = 2e-5
-"""Minimum change of the self-discharge current, as a C-rate [1/h]. A hypothesis with a smaller estimate starts again."""
+"""Minimum change of the self-discharge current, as a C-rate [1/h]: 1.4 % a month, less than ``LEAK_STD`` of an intact cell. A hypothesis
+with a smaller estimate starts again."""
 MIN_CHANGE_FRACTION = 0.3
 """Minimum change relative to the present self-discharge. Old hypotheses would otherwise hide the end of a short."""
 THRESHOLD_STD = 4.0
@@ -72,7 +74,7 @@ def update_hypotheses(
             c.information[h] += change_v * change_v / variance_v2
         for i in range(STATES):
             response[i] -= ph[i] / variance_v2 * change_v
-        if balancing and h == DRAIN:
+        if balancing and h == DRAIN:  # its response grows while a balancer may be active; a restart would discard it
             continue
         is_too_small = not c.score[h] > min_change_c * c.information[h]  # also if it is not finite
         if is_too_small or (h == FALL and c.mean[LEAK] < MIN_CHANGE_C):  # without a self-discharge nothing can fall

@@ -47,7 +47,7 @@ _CONTACT, _OFFSET, _WIRE = int(ReadingFault.CONTACT), int(ReadingFault.OFFSET), 
 
 
 @njit(cache=True)
-def unanswered_v(c: Record, voltage_v: float, reference_v: float) -> float:
+def missed_change_v(c: Record, voltage_v: float, reference_v: float) -> float:
     """Return the change of the median voltage of the cells since the last change of this reading [V].
 
     Args:
@@ -148,6 +148,7 @@ def mark_sense_wires(cells: Records) -> None:
     """Mark neighbors with opposite offsets. Their sum is right, because only the tap between them is wrong."""
     for i in range(cells.size - 1):
         first, second = cells[i], cells[i + 1]
+        # an offset, or a wire that is marked already
         if first.fault >= _OFFSET and second.fault >= _OFFSET:
             larger_v = max(abs(first.offset_v), abs(second.offset_v))
             if abs(first.offset_v + second.offset_v) < OPPOSITE_TOLERANCE * larger_v:

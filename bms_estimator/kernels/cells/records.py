@@ -72,7 +72,10 @@ BANK = np.dtype(
     [
         ("started", "i8"),  # 1: a sample was processed
         ("time_s", "f8"),  # time of the last sample [s]
-        ("unseen_s", "f8"),  # time without samples before the next sample, which has another time base [s]
+        (
+            "unseen_s",
+            "f8",
+        ),  # time without samples before the next sample, whose time base may be another one [s]
         ("current_a", "f8"),  # current of the last sample [A]
         ("soc", "f8"),  # SOC of the pack at the last sample
         ("x_ts_a", "f8"),  # current filtered with tau_ts [A]
@@ -91,4 +94,4 @@ BANK = np.dtype(
     ],
     align=True,
 )
-"""State that all cells of a pack share."""
+"""State that all cells of a pack share: window sums, time, and SOC of the pack."""

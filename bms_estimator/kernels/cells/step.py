@@ -12,7 +12,7 @@ from bms_estimator.kernels.cells.cell_filter import (
     HOUR_S,
     correct_cell,
     curve_variance,
-    deviation_v,
+    deviation_and_slope,
     initialize_cell,
     is_steep_near_full,
     noise_variance,
@@ -33,7 +33,7 @@ from bms_estimator.kernels.cells.reading_faults import (
     examine_reading,
     is_jump,
     mark_sense_wires,
-    unanswered_v,
+    missed_change_v,
 )
 from bms_estimator.kernels.cells.records import FALL, RISE, SOC, STATES, ReadingFault
 from bms_estimator.model.arrays import Floats, Record, Records
@@ -43,10 +43,11 @@ WINDOW_S = 10.0
 """Minimum duration of a window [s]. Its means suppress noise, and delays between the readings of current and cells."""
 MAX_STEP_S = 60.0
 """Maximum time between two samples over which the current counts as measured [s]."""
-MAX_GAP_S = 1e9
-"""Minimum time between two samples that shows another time base [s]: 30 years."""
+NEW_TIME_BASE_S = 1e9
+"""Minimum difference between two times that shows another time base [s]: 30 years."""
 NEAR_FULL_SOC = 0.1
-"""Charge throughput for which the cells are not compared after one of them was nearly full [SOC], if the OCV curve is steep there."""
+"""After a cell was nearly full, and if the OCV curve is steep there, the cells are not compared until this much charge has flowed in
+either direction [SOC]."""
 NEAR_FULL_STD = 0.03
 """Minimum std of a cell's SOC while the cells are not compared."""
 MIN_CELL_SOC, MAX_CELL_SOC = -0.2, 1.2
@@ -65,11 +66,11 @@ def run_cells(
     trace: Records,
     scratch: Floats,
 ) -> None:
-    """Process a block of samples. Samples before the first one that lacks at most one cell voltage have no effect.
+    """Process a block of samples. Processing starts with the first sample in which at most one cell voltage is missing.
 
     Args:
         cells: Shape (m,), dtype CELL; updated.
-        bank: Shape (1,), dtype BANK; updated.
+        bank: State that all cells share, shape (1,), dtype BANK; updated.
         filter_settings: Shape (1,), dtype EKF_SETTINGS.
         balancing_v: Cell voltage from which a balancer may be active [V].
         times_s: Times of the samples [s], shape (n,).
@@ -85,6 +86,7 @@ def run_cells(
             continue
         row = trace[r]
         r += 1
+        # one missing voltage is allowed, because a wire may be broken from the start
         if not (bank[0].started or np.isfinite(cells_v[j]).sum() >= cells.size - 1):
             continue
         if add_sample(cells, bank[0], filter_settings[0], cells_v[j], row) and bank[0].elapsed_s >= WINDOW_S:
@@ -105,7 +107,7 @@ def add_sample(cells: Records, b: Record, p: Record, cells_v: Floats, row: Recor
             initialize_cell(cells[i])
         b.started, b.time_s, b.soc, b.x_ts_a, b.x_tl_a = 1, row.time_s, row.soc, current_a, current_a
     dt_s = row.time_s - b.time_s
-    if not 0.0 <= dt_s < MAX_GAP_S:  # another time base
+    if not 0.0 <= dt_s < NEW_TIME_BASE_S:  # another time base
         dt_s = b.unseen_s
     b.unseen_s = 0.0
     if dt_s > MAX_STEP_S:
@@ -157,15 +159,16 @@ def update_cells(
         may_be_drained = voltages_v[i] > lowest_v + BALANCING_SPREAD_V
         predict_cell(cells[i], b, balancing_variance if may_be_drained else 0.0)
         predict_hypotheses(cells[i], b, balancing)
-        errors_v[i] = voltages_v[i] - deviation_v(cells[i], p, soc, drop_v)[0]
+        errors_v[i] = voltages_v[i] - deviation_and_slope(cells[i], p, soc, drop_v)[0]
     reference_v, median_v = median(errors_v, cells), median(voltages_v, cells)
     for i in range(m):
         if math.isfinite(voltages_v[i]) and math.isfinite(reference_v):
-            slope_v = deviation_v(cells[i], p, soc, drop_v)[1]
+            slope_v = deviation_and_slope(cells[i], p, soc, drop_v)[1]
             curve_v2 = curve_variance(cells[i], p, soc, soc_std)
+            # an error of the curve remains for CURVE_WINDOWS windows; the factor prevents that averaging reduces it
             variance_v2 = noise_variance(drop_v) + CURVE_WINDOWS * curve_v2 + write_ph(cells[i], slope_v, drop_v, ph)
             innovation_v = errors_v[i] - reference_v
-            ignored_v = unanswered_v(cells[i], voltages_v[i], median_v)
+            ignored_v = missed_change_v(cells[i], voltages_v[i], median_v)
             update_cell(
                 cells[i],
                 b,
@@ -211,7 +214,7 @@ def update_cell(
         c: The cell; updated.
         b: Window, dtype BANK.
         slope_v: Derivative of the deviation by the cell's SOC [V].
-        drop_v: Overpotential of the reference cell [V].
+        drop_v: Overpotential of the reference cell, which is a cell by the model of the pack [V].
         innovation_v: Innovation [V].
         variance_v2: Variance S of the innovation [V^2].
         curve_v2: Part of R by the shape of the OCV curve [V^2].
@@ -226,6 +229,7 @@ def update_cell(
         return
     if c.fault == _STUCK:
         end_fault(c)
+    # variance in one window, in which the error of the curve counts once
     window_v2 = variance_v2 - (CURVE_WINDOWS - 1.0) * curve_v2
     if c.suspect_s > 0.0 or (is_jump(c, innovation_v, window_v2, CURVE_STDS * math.sqrt(curve_v2)) and not b.gap):
         examine_reading(c, innovation_v, current_a, b.elapsed_s, window_v2, ignored_v < ALIVE_V)
@@ -233,6 +237,7 @@ def update_cell(
     c.innovation_v += (1.0 - math.exp(-b.elapsed_s / JUMP_S)) * (innovation_v - c.innovation_v)
     if near_full:
         c.covariance[SOC, SOC] = max(c.covariance[SOC, SOC], NEAR_FULL_STD**2)
+        # DRAIN is not restarted: its response grows while a balancer may be active, as when cells are nearly full
         restart_hypothesis(c, RISE)
         restart_hypothesis(c, FALL)
         return
@@ -243,7 +248,7 @@ def update_cell(
 
 @njit(cache=True)
 def balancing_soc_variance(b: Record, active: bool) -> float:
-    """Return the variance of a cell's SOC that a balancer may have changed in the window ``b``, dtype BANK.
+    """Return the variance that a possible balancer adds to a cell's SOC in the window ``b``, dtype BANK.
 
     A balancer drains the same cells for hours. The std therefore grows in proportion to the time.
     """
@@ -271,7 +276,7 @@ def median(values: Floats, cells: Records) -> float:
 
 @njit(cache=True)
 def ranked(values: Floats, cells: Records, rank: int) -> float:
-    """Return the value with ``rank`` smaller ones, from 0, among the finite values of cells without a faulty reading."""
+    """Return the value of rank ``rank``, from 0 for the smallest, among the finite values of cells without a faulty reading."""
     for i in range(values.size):
         if math.isfinite(values[i]) and cells[i].fault == _NONE:
             smaller = equal = 0

@@ -1,6 +1,8 @@
 """Detection of a frozen voltage or current: a constant value that charge or load contradict.
 
-A loose wire or a hanging converter causes such values.
+A loose wire or a hanging converter causes such values. In CHECKS, ``held_*`` are values at or since the last change of the
+voltage, ``same_*`` those at or since the last change of the current. ``slow_v`` and ``slow_a`` are means over ``FAST_S``,
+``slower_v`` is that of ``slow_v``.
 
 ``c`` is a record of CHECKS, ``f`` of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -22,8 +24,8 @@ FROZEN_S = 60.0
 SWING_V = 0.02
 """Change of the voltage of one cell that proves a constant current frozen [V]."""
 NOISE_STEPS = 4.0
-"""Minimum change of the voltage for the proof that a constant current is frozen, in multiples of the mean change between two samples.
-The voltage follows a load for longer than one sample, so that its mean change is small. Noise changes it at each sample."""
+"""A constant current is frozen only if the voltage changes by more than this multiple of its mean change between two samples. A load
+moves the voltage seldom, noise at each sample, so that noise alone never exceeds the limit."""
 MIN_RESOLUTION_STEPS = 3.0
 """Minimum change of the voltage for a proof, in multiples of its resolution."""
 OCV_CHANGE_V = 0.01
@@ -34,7 +36,8 @@ chargers regulate the voltage."""
 UNOBSERVED_CHARGE_ERROR = 0.1
 """Relative error of the charge counted while the voltage is not used."""
 OUTLIERS_S = 3600.0
-"""Time constant with which rejected single samples are discounted [s]."""
+"""Time constant with which rejected single samples and single contradictions are discounted, and maximum averaging time of the noise
+[s]."""
 
 
 @njit(cache=True)
@@ -46,7 +49,7 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
     counted_s = min(dt_s, FAST_S)
     has_fast_changes = dt_s <= FAST_S and c.slow_v != 0.0  # 0: there are no slow means yet
     ocv_moved = voltage_stuck = False
-    # with the default noise of half a resolution step, sqrt(3 sensor_v2) is one step
+    # one step: with the default noise of half a step, sensor_v2 is step^2 / 4 + step^2 / 12 = step^2 / 3
     resolved_v = MIN_RESOLUTION_STEPS * max(c.step_v, math.sqrt(3.0 * p.sensor_v2))
     change_v = abs(voltage_v - c.last_v)
     if c.last_v == 0.0 or change_v > 0.0:
@@ -58,6 +61,7 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
         c.held_as += 0.5 * (c.last_a + current_a) * min(dt_s, p.unmeasured_s)
         loaded = current_a >= LOAD_C * p.capacity_as / 3600.0
         ocv_moved = loaded and ocv_has_moved(c, f, p, current_a, resolved_v)
+        # below LOAD_C the change must also be sudden
         change_a = abs(current_a - c.held_a) if loaded else min(abs(current_a - c.held_a), abs(current_a - c.slow_a))
         dropped_v = reference_series_resistance(p) * change_a if has_fast_changes else 0.0
         voltage_stuck = ocv_moved or dropped_v > max(VISIBLE_V * p.series, resolved_v)
@@ -67,6 +71,7 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
     if c.last_v == 0.0 or current_a != c.last_a:
         c.frozen_a_s = c.same_s = 0.0
         c.same_soc, c.same_soc_std = f.soc, f.soc_std
+    # a charge that contradicts the voltage may also be due to a current that froze under load
     elif ocv_moved or (has_fast_changes and voltage_has_swung(c, p, counted_s, voltage_v, resolved_v)):
         c.frozen_a_s += counted_s
     elif c.frozen_a_s < FROZEN_S:  # discount single glitches at rest
@@ -82,13 +87,14 @@ def voltage_has_swung(c: Record, p: Record, counted_s: float, voltage_v: float, 
     share = counted_s / min(max(c.same_s, counted_s), OUTLIERS_S)  # a mean over the time of the constant current
     c.noise_v += share * (abs(voltage_v - c.last_v) - c.noise_v)
     limit_v = max(SWING_V * p.series, resolved_v, NOISE_STEPS * c.noise_v)
+    # the second difference is 0 for a steady drift of the voltage
     return abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > limit_v
 
 
 @njit(cache=True)
 def reference_series_resistance(p: Record) -> float:
     """Return R_0 of the cell file at SOC 0.5 and 25 C [ohm]."""
-    middle = p.weak_ohm.shape[0] // 2
+    middle = p.weak_ohm.shape[0] // 2  # the parts with weak and with strong temperature dependence add up
     return p.weak_ohm[middle, 0] + p.strong_ohm[middle, 0]
 
 

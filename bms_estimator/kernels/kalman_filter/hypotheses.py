@@ -78,7 +78,7 @@ the spacing of the evenly spaced hypotheses, which represent a wider distributio
 SPREAD_STDS = 2.25
 """Distance of the outermost hypotheses from the initial SOC, in std of that SOC."""
 OVERLAP = 0.62
-"""Std of a hypothesis, as a fraction of the distance between neighbours."""
+"""Std of a hypothesis, as a fraction of the distance between neighbors."""
 BEYOND_STD = 0.03
 """Std over SOC with which the prior weight falls beyond ``MIN_SOC`` and ``MAX_SOC`` [SOC]. A hypothesis there is moved to the
 limit."""
@@ -387,7 +387,7 @@ def innovation_scale(s: Record, p: Record) -> float:
 
     R and the biases cover the loads and cells that the file fits worst. The fit usually improves after the effects of the
     load before switch-on have decayed. With innovations much smaller than S, the term ln S would decide between the
-    hypotheses and favour the smallest S. Outside the temperature range of the cell file the ratio increases and reaches 1
+    hypotheses and favor the smallest S. Outside the temperature range of the cell file the ratio increases and reaches 1
     at a distance of ``OUTSIDE_K``.
     """
     return min(

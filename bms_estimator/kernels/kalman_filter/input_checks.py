@@ -369,6 +369,6 @@ def plateau_level_bit(f: Record, p: Record, before: int) -> int:
 
 @njit(cache=True)
 def is_significant_bias(value: float, variance: float, expected: float, before: int) -> bool:
-    """Return True if a bias exceeds its expected size significantly."""
+    """Return True if a bias exceeds its expected size significantly. ``before`` is not 0 if the fault is present."""
     fraction = CLEAR_FRACTION if before else 1.0
     return expected > 0.0 and abs(value) > fraction * max(expected, PRESENT_STDS * math.sqrt(variance))

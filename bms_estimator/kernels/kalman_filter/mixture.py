@@ -12,7 +12,7 @@ from bms_estimator.numba_cache import njit
 MIN_LN_WEIGHT = -9.0
 """ln of the ratio to the weight of the likeliest hypothesis, below which a hypothesis is removed."""
 MERGE_STDS = 0.7
-"""SOC distance below which two neighbouring hypotheses are merged, in multiples of the smaller SOC std of the two."""
+"""SOC distance below which two neighboring hypotheses are merged, in multiples of the smaller SOC std of the two."""
 
 
 @njit(cache=True)
@@ -45,7 +45,7 @@ def clear_hypothesis(s: Record, q: int) -> None:
 
 @njit(cache=True)
 def prune_and_merge(s: Record) -> None:
-    """Remove unlikely hypotheses, and merge similar neighbours."""
+    """Remove unlikely hypotheses, and merge similar neighbors."""
     top, q = s.ln_weight[s.best], 0
     while q < s.count:
         s.ln_weight[q] -= top

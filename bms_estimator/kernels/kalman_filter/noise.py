@@ -176,6 +176,7 @@ def add_process_noise(s: Record, p: Record, q: int, throughput: float, bias_v2: 
     error_a2 = (p.x_relative * w.charge_as / dt_s) ** 2
     for k in range(X, X + BRANCHES):
         cov[k, k] += error_a2 * (1.0 - f[k] * f[k])
+    # both biases have half of the variance
     cov[B_SLOW, B_SLOW] += 0.5 * bias_v2 * s.slow_inflation[q] * (1.0 - f[B_SLOW] ** 2)
     cov[B_FAST, B_FAST] += 0.5 * bias_v2 * s.fast_inflation[q] * (1.0 - f[B_FAST] ** 2)
     cov[OFFSET, OFFSET] += offset_variance(p) * (1.0 - f[OFFSET] ** 2)

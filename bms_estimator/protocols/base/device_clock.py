@@ -1,6 +1,6 @@
 """Sample times from a device's timestamps if they are plausible, otherwise from the arrival times.
 
-Check of a device's clock against the arrival times of its samples: its rate, and repeated jumps.
+Timestamps are implausible if the device's clock has a wrong rate, or jumps repeatedly, compared with the arrival times.
 """
 
 import itertools

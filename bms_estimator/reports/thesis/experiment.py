@@ -1,8 +1,6 @@
-"""Data of chapter 5 of the thesis: real captures, or the simulated pack measured by two sensor chains.
+"""Claims of chapters 4 to 7 of the thesis about its recordings, tested on other captures.
 
-Claims of chapters 4 to 7 about the thesis's recordings, tested on other captures.
-
-A claim holds if the error is at most the printed value on more than half of the captures. For the SOC and the RC
+The captures are real, or the simulated pack is measured by two sensor chains. A claim holds if the error is at most the printed value on more than half of the captures. For the SOC and the RC
 products the thesis prints no value that could be a limit. Their limits, and the limit 1 of the ratio between the
 dynamic and the static model, are chosen here.
 """
@@ -293,6 +291,6 @@ class Experiment:
         return f"{len(self.recorded.samples)} captures of {self.recorded.cell.cell.name}"
 
     @property
-    def unpublished(self) -> str:
-        """Reason for which the printed numbers cannot be reproduced."""
+    def data_note(self) -> str:
+        """Sentence on the data, and the reason for which the printed numbers cannot be reproduced."""
         return f"The thesis's recordings are not published. Its procedure was run on {self.data_source}."

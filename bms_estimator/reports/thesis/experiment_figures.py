@@ -28,7 +28,7 @@ def _figure(
     key: str, title: str, svg: str, experiment: Experiment, reason: str, *, claims: tuple[str, ...] = ()
 ) -> Figure:
     verdict, tested = experiment.verdict_on_claims(*claims) if claims else (Reproduction.NO_DATA, "")
-    return Figure(key, title, svg, verdict, f"{experiment.unpublished} {tested}{reason}")
+    return Figure(key, title, svg, verdict, f"{experiment.data_note} {tested}{reason}")
 
 
 def figure_26(experiment: Experiment) -> Figure:
@@ -39,7 +39,7 @@ def figure_26(experiment: Experiment) -> Figure:
         grid = np.linspace(0.0, 1.0, 600)
         for color, test in zip(np.resize(COLORS, len(p.tests)), p.tests, strict=True):
             axes[0].errorbar(test.soc, test.ocv_v, 2.0 * test.std_v, fmt="o", ms=3, color=color, label=test.name)
-        if experiment.recorded is None:
+        if experiment.recorded is None:  # Table 8 is of the pack that is simulated
             axes[0].plot(
                 grid, chen_mora(np.array(printed_values.TABLE_8), grid), ":", linewidth=2.4, label="(2.10), Table 8"
             )
@@ -92,7 +92,11 @@ def figure_28(experiment: Experiment) -> Figure:
     crossings = ", ".join(f"{c.parameter} at SOC {c.soc:.5f}" for c in run.crossings)
     if min(c.soc for c in run.crossings) <= 0.0:
         return _figure(
-            "28", "a8 and a11 meet their stability conditions", "", experiment, f"There is no crossing: {crossings}."
+            "28",
+            "a8 and a11 meet their stability conditions",
+            "",
+            experiment,
+            f"Not every crossing is above SOC 0: {crossings}.",
         )
     return _figure(
         "28",
@@ -111,7 +115,7 @@ def figure_29(experiment: Experiment) -> Figure:
         "R_ts·C_ts and R_tl·C_tl as estimated",
         plot(lambda axes: products_plot(axes, None, run.average), columns=2, salt="figure-29"),
         experiment,
-        "They are the products of the bounds' limits (E3).",
+        "The products are those of the limits to which a1..a12 converge, which the bounds define (E3).",
         claims=("RC products",),
     )
 
@@ -142,9 +146,8 @@ def figure_31(experiment: Experiment) -> Figure:
             true = truth[13] * np.exp(-truth[14] * SOC_GRID) + truth[15]
             axes.plot(SOC_GRID, 1e3 * true, color=FAINT, linewidth=2.4, label="(2.9), Table 9")
         middle = 1e3 * float(np.median(p.r_s_mean.r_s_ohm))
-        axes.set(
-            xlabel="SOC", ylabel="R_s [mΩ]", ylim=(min(0.5 * middle, 1.5 * middle), max(0.5 * middle, 1.5 * middle))
-        )
+        # sorted, because (4.2) can give a negative resistance
+        axes.set(xlabel="SOC", ylabel="R_s [mΩ]", ylim=sorted((0.5 * middle, 1.5 * middle)))
         axes.legend(ncols=2)
 
     return _figure(
@@ -157,14 +160,14 @@ def figure_31(experiment: Experiment) -> Figure:
     )
 
 
-def _constant(p: Procedure) -> list[str]:
+def constant_loads(p: Procedure) -> list[str]:
     """Return the names of the constant loads, at most ``MAX_LOADS``."""
     return [c.name for c in p.captures_of(Kind.CONSTANT)][:MAX_LOADS]
 
 
-def _steps(p: Procedure) -> list[str]:
+def step_loads(p: Procedure) -> list[str]:
     """Return the names of the first two loads that are not constant."""
-    return [name for name in p.dynamic if name not in _constant(p)][:2]
+    return [c.name for c in p.captures_of(Kind.STEPS)][:2]
 
 
 def _largest_error(p: Procedure, names: list[str]) -> str:
@@ -217,14 +220,14 @@ def figure_32(experiment: Experiment) -> Figure:
     """Draw the voltages under constant loads."""
     p = experiment.procedure
     title = "Constant loads: actual and estimated voltage"
-    return _figure("32", title, _grid(_constant(p), _voltages(p), "32"), experiment, "")
+    return _figure("32", title, _grid(constant_loads(p), _voltages(p), "32"), experiment, "")
 
 
 def figure_33(experiment: Experiment) -> Figure:
     """Draw the errors under constant loads."""
     p = experiment.procedure
-    svg = _grid(_constant(p), _errors(p), "33")
-    reason = f"{_largest_error(p, _constant(p))} Printed: at most {printed_values.MAX_CONSTANT:g} %."
+    svg = _grid(constant_loads(p), _errors(p), "33")
+    reason = f"{_largest_error(p, constant_loads(p))} Printed: at most {printed_values.MAX_CONSTANT:g} %."
     return _figure("33", "Constant loads: error", svg, experiment, reason, claims=("constant loads, largest",))
 
 
@@ -236,7 +239,7 @@ def figure_34(experiment: Experiment) -> Figure:
 
 def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> Figure:
     p = experiment.procedure
-    names = _steps(p)[index : index + 1] or _steps(p)[-1:]
+    names = step_loads(p)[index : index + 1] or step_loads(p)[-1:]
     return _figure(key, title, _grid(names, _voltages(p), key), experiment, _largest_error(p, names))
 
 
@@ -248,7 +251,7 @@ def figure_35(experiment: Experiment) -> Figure:
 def figure_36(experiment: Experiment) -> Figure:
     """Draw the currents of the steps."""
     p = experiment.procedure
-    captures = [c for c in p.captures if c.name in _steps(p)]
+    captures = [c for c in p.captures if c.name in step_loads(p)]
     return _figure("36", "Steps: currents", _currents(captures, "36"), experiment, "")
 
 
@@ -260,15 +263,15 @@ def figure_37(experiment: Experiment) -> Figure:
 def figure_38(experiment: Experiment) -> Figure:
     """Draw the errors under steps."""
     p = experiment.procedure
-    reason = f"{_largest_error(p, _steps(p))} Printed: at most {printed_values.MAX_STEPS:g} %."
-    svg = _grid(_steps(p), _errors(p), "38")
+    reason = f"{_largest_error(p, step_loads(p))} Printed: at most {printed_values.MAX_STEPS:g} %."
+    svg = _grid(step_loads(p), _errors(p), "38")
     return _figure("38", "Steps: error", svg, experiment, reason, claims=("steps, largest",))
 
 
 def figure_40(experiment: Experiment) -> Figure:
     """Draw the errors of the dynamic and the static model."""
     p = experiment.procedure
-    name = (_steps(p) or _constant(p))[-1]
+    name = (step_loads(p) or constant_loads(p))[-1]
     svg = plot(lambda axes: dynamic_static_plot(axes, p.dynamic[name], p.static[name]), columns=2, salt="figure-40")
     return _figure("40", f"Dynamic and static model on {name}", svg, experiment, "")
 
@@ -276,7 +279,7 @@ def figure_40(experiment: Experiment) -> Figure:
 def figure_41(experiment: Experiment) -> Figure:
     """Draw the SOC by interpolation."""
     p = experiment.procedure
-    run, (soc, _) = p.dynamic[p.largest], p.interpolated(p.largest)
+    run, (soc, _) = p.dynamic[p.largest_load], p.interpolated(p.largest_load)
     rms = float(np.sqrt(np.mean((soc - run.soc) ** 2)))
 
     def draw(axes: Any) -> None:
@@ -291,7 +294,7 @@ def figure_41(experiment: Experiment) -> Figure:
 
     return _figure(
         "41",
-        f"SOC by coulomb counting and by interpolation in E_o, {p.largest}",
+        f"SOC by coulomb counting and by interpolation in E_o, {p.largest_load}",
         plot(draw, columns=2, salt="figure-41"),
         experiment,
         f"They differ by {100 * rms:.2f} % of SOC RMS.",
@@ -302,7 +305,7 @@ def figure_41(experiment: Experiment) -> Figure:
 def figure_42(experiment: Experiment) -> Figure:
     """Draw E_o over the counted and the interpolated SOC."""
     p = experiment.procedure
-    run, (soc, e_o) = p.dynamic[p.largest], p.interpolated(p.largest)
+    run, (soc, e_o) = p.dynamic[p.largest_load], p.interpolated(p.largest_load)
 
     def draw(axes: Any) -> None:
         x, y = thin(run.soc, e_o)
@@ -312,7 +315,7 @@ def figure_42(experiment: Experiment) -> Figure:
         axes.set(xlabel="SOC", ylabel="V")
         axes.legend()
 
-    return _figure("42", f"E_o over SOC, {p.largest}", plot(draw, salt="figure-42"), experiment, "")
+    return _figure("42", f"E_o over SOC, {p.largest_load}", plot(draw, salt="figure-42"), experiment, "")
 
 
 FIGURES: dict[str, Callable[[Experiment], Figure]] = {

@@ -44,7 +44,7 @@ def table_8(experiment: Experiment) -> Table:
         tuple(columns),
         tuple(rows),
         Reproduction.NO_DATA,
-        f"{experiment.unpublished} {points.soc.size} points; residual RMS (largest): joint fit "
+        f"{experiment.data_note} {points.soc.size} points; residual RMS (largest): joint fit "
         f"{1e3 * rms_v(joint.residual_v):.2f} ({1e3 * max_v(joint.residual_v):.2f}) mV, mean of the parameters "
         f"{1e3 * rms_v(residual_of_mean_v):.2f} ({1e3 * max_v(residual_of_mean_v):.2f}) mV, monotone table {1e3 * rms_v(table.residual_v):.2f} "
         f"({1e3 * max_v(table.residual_v):.2f}) mV.{coarse}",
@@ -68,7 +68,7 @@ def table_9(experiment: Experiment) -> Table:
         columns,
         tuple(rows),
         Reproduction.NO_DATA,
-        f"{experiment.unpublished} R_s by (4.2), with the sign of (2.4) and each value weighted by its current squared (E19), "
+        f"{experiment.data_note} R_s by (4.2), with the sign of (2.4) and each value weighted by its current squared (E19), "
         f"over {len(procedure.r_s_curves)} constant loads and relaxation tests; residual of the fit {1e3 * fit.rms_ohm:.2f} mΩ RMS. "
         "R_s absorbs the error of R_ts + R_tl, which come from the bounds. If a13 is 0, R_s does not rise towards empty.",
     )
@@ -168,7 +168,7 @@ def table_11(experiment: Experiment) -> Table:
         tuple(columns),
         tuple(rows),
         verdict,
-        f"{experiment.unpublished} {claim_results}a1 to a12 from {procedure.smallest.name}, a16 to a21 from the relaxation tests, a13 "
+        f"{experiment.data_note} {claim_results}a1 to a12 from {procedure.smallest.name}, a16 to a21 from the relaxation tests, a13 "
         f"to a15 from all constant loads and relaxation tests except that of the row. Errors are in percent of the measured voltage, "
         f"from the first sample until SOC {procedure.lowest_soc:.2g}, counted from full. "
         + (
@@ -203,7 +203,7 @@ def table_13(experiment: Experiment) -> Table:
         ("model", "printed", "mean over the loads", "worst load"),
         rows,
         verdict,
-        f"{experiment.unpublished} {claim_results}The static model is frozen at SOC {STATIC_SOC:g}; the thesis does not print its own. "
+        f"{experiment.data_note} {claim_results}The static model is frozen at SOC {STATIC_SOC:g}; the thesis does not print its own. "
         "The printed 0.003 % of the dynamic model is a hundredth of the errors of Table 11, so that its definition must differ.",
     )
 

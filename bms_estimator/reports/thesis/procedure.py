@@ -260,7 +260,7 @@ class Procedure:
         return {c.name: self._predict(c, static_elements(self.a_for(c.name), STATIC_SOC)) for c in self.loads}
 
     @cached_property
-    def largest(self) -> str:
+    def largest_load(self) -> str:
         """Name of the constant load with the largest current (the bulb in Fig. 41); without one, of the first load."""
         constant = self.captures_of(Kind.CONSTANT) or self.loads[:1]
         return max(constant, key=lambda c: float(np.median(c.samples["current_a"]))).name

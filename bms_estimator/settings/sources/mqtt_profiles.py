@@ -1,7 +1,8 @@
 """Profiles of battery projects that publish over MQTT: defaults of ``[source]`` by the project's name.
 
-``{prefix}`` is ``source.prefix``, ``{instance}`` is ``source.instance``, and ``{cell}`` is the number of a cell from 1.
-Explicit settings take precedence over a profile. Each profile names its source, as of November 2026.
+``{prefix}`` is ``source.prefix``, ``{instance}`` is ``source.instance``, ``{cell}`` is the number of a cell and ``{probe}`` that of
+a temperature probe, both from 1. Explicit settings take precedence over a profile. A comment above each profile names the files
+from which it was taken in November 2026.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +33,7 @@ class Profile(NamedTuple):
     voltage_resolution_v: float
     current_resolution_a: float
     protocol: str = ""
-    """Protocol of the same BMS on a serial line, whose dead band of the current applies; empty: no dead band is known."""
+    """Serial protocol of the same BMS, from which the profile has its dead band of the current; empty: no dead band is known."""
     required_settings: Mapping[str, str] = {}
     """Descriptions of the settings without which the profile is incomplete, by name."""
 

@@ -1,8 +1,7 @@
 """InfluxDB sink: line protocol over HTTP, in batches.
 
-``publish`` queues lines. A task sends them in a thread, so that the event loop never waits for the server.
-
-Conversion of snapshots to InfluxDB's line protocol, with the names that Telegraf gives MQTT payloads. No I/O.
+``publish`` queues lines. A task sends them in a thread, so that the event loop never waits for the server. The lines have the
+names that Telegraf gives the fields of the MQTT payloads.
 """
 
 import asyncio
@@ -25,7 +24,7 @@ import structlog
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
-from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.process.systemd import credential
 from bms_estimator.process.tasks import FIRST_DELAY_S, Backoff
 from bms_estimator.settings.exports import InfluxSettings
@@ -101,8 +100,8 @@ MAX_LOGGED_CHARACTERS = 200
 log = structlog.get_logger(__name__)
 
 
-class RefusedError(Exception):
-    """The server did not accept the lines."""
+class WriteError(Exception):
+    """The lines were not written: the server is unreachable or rejects them, or a file of the settings cannot be read."""
 
     def __init__(self, reason: str, *, is_retryable: bool) -> None:
         super().__init__(reason)
@@ -137,7 +136,7 @@ class InfluxSink:
         self._previous: Snapshot | None = None
         self._batch_is_full, self._closing = asyncio.Event(), asyncio.Event()
         self._failure = ""  # reason for the last failed request; empty after a success
-        self._thread = DiskThread("influx")
+        self._thread = DaemonThreadExecutor("influx")
         self._task: asyncio.Task[None] | None = None
         self.dropped = 0
         """Number of lines dropped from a full queue or permanently rejected by the server."""
@@ -204,7 +203,7 @@ class InfluxSink:
                 self._batch.append(self._queue.popleft())
             try:
                 await loop.run_in_executor(self._thread, partial(_post, self._settings, "\n".join(self._batch)))
-            except RefusedError as error:
+            except WriteError as error:
                 self._log_failure(str(error))
                 if error.is_retryable:
                     return False
@@ -218,11 +217,13 @@ class InfluxSink:
         """Log a reason if it has changed."""
         if reason != self._failure:
             self._failure = reason
-            log.warning("influxdb rejects lines", url=self._settings.url, reason=reason, lines_waiting=self.waiting)
+            log.warning(
+                "lines are not written to influxdb", url=self._settings.url, reason=reason, lines_waiting=self.waiting
+            )
 
     def _record_success(self) -> None:
         if self._failure:
-            log.info("influxdb accepts lines again", url=self._settings.url, lines_lost=self.dropped)
+            log.info("lines are written to influxdb again", url=self._settings.url, lines_lost=self.dropped)
             self._failure = ""
         self._backoff.reset()
 
@@ -296,7 +297,7 @@ def _post(settings: InfluxSettings, body: str) -> None:
     """Write lines.
 
     Raises:
-        RefusedError: The server has not accepted the lines.
+        WriteError: The server has not accepted the lines.
     """
     try:
         url, headers, context = target(settings)
@@ -306,11 +307,11 @@ def _post(settings: InfluxSettings, body: str) -> None:
             return
     except urllib.error.HTTPError as error:
         reason = f"{error.code} {error.reason}: {_printable(_response_start(error))}"
-        raise RefusedError(reason, is_retryable=error.code not in PERMANENT_ERRORS) from None
+        raise WriteError(reason, is_retryable=error.code not in PERMANENT_ERRORS) from None
     except urllib.error.URLError as error:
-        raise RefusedError(str(error.reason), is_retryable=True) from None
+        raise WriteError(str(error.reason), is_retryable=True) from None
     except (OSError, http.client.HTTPException, UnicodeError, UserError) as error:  # UnicodeError: invalid host name
-        raise RefusedError(str(error) or type(error).__name__, is_retryable=True) from None
+        raise WriteError(str(error) or type(error).__name__, is_retryable=True) from None
 
 
 def _response_start(error: urllib.error.HTTPError) -> bytes:

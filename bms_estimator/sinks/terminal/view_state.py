@@ -50,7 +50,7 @@ class ViewState(NamedTuple):
     pack: PackView | None = None
     """None before the first publication."""
     log: Sequence[str] = ()
-    """Log lines, oldest first; ANSI colours are allowed."""
+    """Log lines, oldest first; ANSI colors are allowed."""
     hint: str = ""
     """Last line of the screen."""
     true_soc: float | None = None

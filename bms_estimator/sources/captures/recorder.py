@@ -11,7 +11,7 @@ from typing import Self
 
 import structlog
 
-from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 
 SYNC_S = 5.0
@@ -52,7 +52,7 @@ class CaptureRecorder:
         self._queue: queue.SimpleQueue[tuple[float, bytes] | OSError | None] = queue.SimpleQueue()
         self._overflowed = False
         self._received_chunks = self._written_chunks = self.bytes = 0
-        self.ended: Future[None] = DiskThread("recording").submit(self._record)
+        self.ended: Future[None] = DaemonThreadExecutor("recording").submit(self._record)
 
     @property
     def missed_reads(self) -> int:

@@ -34,8 +34,8 @@ def read_trip(
 ) -> tuple[Trip, Capture | None]:
     """Read the trip of a file. Return the trip, and the capture if the file is one.
 
-    A text table with the column ``time_s`` and either ``current_a`` or ``power_w`` is a profile, unless it also contains
-    ``current_a`` and ``voltage_v``, which make it a capture.
+    A text table with the column ``time_s`` is a profile, which must have exactly one of the columns ``current_a`` and ``power_w``.
+    A table with ``time_s``, ``current_a`` and ``voltage_v`` is a capture, as is any other file.
 
     Args:
         path: The file.
@@ -77,8 +77,9 @@ def _profile(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]], s
     """
     found = [name for name in LOADS if name in header]
     if len(found) != 1:
-        columns = f"found {', '.join(header)}"
-        raise UserError(f"{path}: {columns}: needed are {TIME} and one column of the load, {' or '.join(LOADS)}")
+        raise UserError(
+            f"{path}: needs {TIME} and exactly one of {' and '.join(LOADS)}; its columns are {', '.join(header)}"
+        )
     [quantity] = found
     has_decimal_comma = separator != "," and uses_decimal_comma([cell for row in rows for cell in row])
     time_s, values = (
@@ -115,7 +116,7 @@ def _cell(
 
 
 def _trip_of_capture(path: Path, capture: Capture) -> Trip:
-    """Return the trip with the current of a capture. Samples without a time or current, or back in time, are left out.
+    """Return the trip with the current of a capture. Only samples with a current that are later than all before them count.
 
     Raises:
         UserError: The capture cannot be read, or ``profile_trip`` rejects it.

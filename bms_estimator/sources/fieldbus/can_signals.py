@@ -161,8 +161,8 @@ def _signals(settings: CanSource) -> Iterator[tuple[SignalKey, Signal]]:
     yield from ((("temperature", number), signal) for number, signal in enumerate(settings.temperature))
     if settings.soc is not None:
         yield ("soc", 0), settings.soc
-    members = [signal for cells in settings.cells for signal in cells.cell_signals()]
-    yield from ((("cells", number), signal) for number, signal in enumerate(members))
+    cell_signals = [signal for group in settings.cells for signal in group.cell_signals()]
+    yield from ((("cells", number), signal) for number, signal in enumerate(cell_signals))
 
 
 def _load_profile(profile: str | None) -> Database:

@@ -1,6 +1,6 @@
 """``kind = "modbus"``: a Modbus device on the network or on a serial line, whose registers are polled.
 
-Decoding of Modbus registers to a reading, and planning of the requests. No I/O.
+Neighboring registers are read by one request.
 """
 
 import asyncio

@@ -1,10 +1,7 @@
 """``kind = "linux"``: a current sensor with a kernel driver, polled through its sysfs files.
 
-A thread reads the files, so that a hung bus does not block the event loop.
-
-Sensors with a kernel driver: their folders in sysfs, by chip name, and their values in SI units.
-
-hwmon: ``in*_input`` [mV], ``curr*_input`` [mA], ``temp*_input`` [millidegC], ``shunt_resistor`` [uohm], ``update_interval``
+A thread reads the files, so that a hung bus does not block the event loop. A chip is found by its name, and its values are
+converted to SI units. hwmon: ``in*_input`` [mV], ``curr*_input`` [mA], ``temp*_input`` [millidegC], ``shunt_resistor`` [uohm], ``update_interval``
 [ms], see Documentation/hwmon/sysfs-interface.rst and ina2xx.rst of the kernel. iio: a channel is ``<name>_raw``,
 ``<name>_scale`` and optionally ``<name>_offset``; (raw + offset) * scale is in mV, mA or millidegC, see sysfs-bus-iio.
 """
@@ -16,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from bms_estimator.model.decimal_text import number
-from bms_estimator.process.disk_thread import DiskThread
+from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.linux import LinuxSource
@@ -185,7 +182,7 @@ class _Channels(NamedTuple):
 
 
 class LinuxSensor(LineProducer):
-    """Line producer that polls the sysfs files of a chip.
+    """Producer of samples as lines of JSON, which polls the sysfs files of a chip.
 
     Args:
         settings: Chip, files, divider and shunt.
@@ -195,7 +192,7 @@ class LinuxSensor(LineProducer):
 
     def __init__(self, settings: LinuxSource, root: Path = SYS, read_timeout_s: float = READ_TIMEOUT_S) -> None:
         self._settings, self._root, self._read_timeout_s = settings, root, read_timeout_s
-        self._thread = DiskThread("sysfs")
+        self._thread = DaemonThreadExecutor("sysfs")
         self._hung_call: asyncio.Future[Any] | None = None  # the thread runs one call at a time, so this must end first
         self._counters = {"read_errors": 0, "value_errors": 0}
         self._fault: str | None = None

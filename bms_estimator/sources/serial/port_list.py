@@ -125,7 +125,7 @@ def open_port(path: str, baud: int, timeout_s: float = 0.0) -> serial.Serial:
 
 
 def holder(port: str) -> str | None:
-    """Return the other process that has ``port`` open, as ``name (pid n)``; None without a visible one."""
+    """Return the other process that has ``port`` open, as ``name (pid n)``; None if no process is found, or it belongs to another user."""
     device = os.path.realpath(port)
     for process in Path("/proc").glob("[0-9]*"):
         if process.name != str(os.getpid()) and _has_open(process, device):

@@ -1,5 +1,7 @@
 """OCV from several captures: slow charges and discharges, relaxation tests, and given curves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from bms_estimator.calibration.ocv.hysteresis import (
     TYPICAL_HYSTERESIS_STD,
     center_on_typical_hysteresis,
 )
-from bms_estimator.calibration.ocv.slow_branch import slow_branches
+from bms_estimator.calibration.ocv.slow_branch import measured_capacity_ah, slow_branches
 from bms_estimator.calibration.ocv.slow_curve import GRID
 from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
@@ -260,6 +262,12 @@ def test_a_slow_discharge_with_a_gap_of_hours_measures_no_capacity() -> None:
     with_gap = np.delete(samples, np.s_[middle : middle + 480])  # 4 h
     with pytest.raises(UserError, match="--capacity-ah: not given"):
         sources_of(with_gap)
+
+
+def test_a_discharge_after_a_charge_that_did_not_fill_the_cell_measures_no_capacity() -> None:
+    (discharge,) = slow_branches(slow((1.0,)), "c20", StartSoc())
+    charged_before = replace(discharge, start=StartSoc(0.5), before_ah=-0.3 * CAPACITY_AH)
+    assert measured_capacity_ah([charged_before, discharge]) == measured_capacity_ah([discharge])
 
 
 def test_the_first_record_of_a_slow_discharge_with_the_old_voltage_does_not_hide_the_ohmic_step() -> None:

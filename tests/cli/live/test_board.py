@@ -32,7 +32,7 @@ def running_board(**options):
 
 @pytest.fixture
 def long_timeouts(monkeypatch):
-    """Set timeouts that a board that responds never reaches."""
+    """Set timeouts that are too long for a responding board to reach."""
     monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(device_detection, "REFERENCE_TIMEOUT_S", LONG_S)
 

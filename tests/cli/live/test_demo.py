@@ -73,11 +73,12 @@ async def test_client_receives_states_from_start_to_offline():
 
 
 @pytest.mark.thorough
-async def test_the_method_of_the_thesis_runs_alone_and_moves_its_parameters_to_the_limits_of_their_bounds():
+async def test_the_method_of_the_thesis_runs_alone_and_moves_its_parameters_to_the_middle_of_their_bounds():
     port = free_port()
     async with demo("--thesis", "--speed", 5, "--rate-hz", 20, "--port", port) as process:
         listener = await connect_listener(port)
         try:
+            # the SOC begins to fall from 0.9 after a rest, during which the parameters converge
             first = await listener.wait_json("bms/demo/parameters", lambda p: p["a"] and p["a"]["a1"]["value"] > 1.0)
             state = await listener.wait_json("bms/demo/state", lambda s: s["soc"] < 0.897)
             last = await listener.wait_json("bms/demo/parameters", lambda p: p["soc"] and p["soc"] < 0.897)
@@ -87,13 +88,15 @@ async def test_the_method_of_the_thesis_runs_alone_and_moves_its_parameters_to_t
         async with asyncio.timeout(LONG_S):
             out, _ = await process.communicate()
     assert first["a"]["a4"]["value"] > 1.5 * last["a"]["a4"]["value"]
-    limits = {"a1": 0.55, "a2": 30.0, "a4": 5.5, "a6": 0.055}  # mean of upper and lower bound: their weights are equal
+    limits = {"a1": 0.55, "a2": 30.0, "a4": 5.5, "a6": 0.055}  # both bounds have equal weights, therefore their mean
     assert {name: last["a"][name]["value"] for name in limits} == pytest.approx(limits, rel=0.02)
-    assert last["elements"]["r_s_ohm"]["value"] == pytest.approx(0.0745, rel=0.1)  # true R_s, by (4.2)
+    assert last["elements"]["r_s_ohm"]["value"] == pytest.approx(0.0745, rel=0.1)  # the true R_s; (4.2) of the thesis
     assert (state["soc_std"], state["time_to_cutoff_s"]) == (None, None)
-    assert state["delta_2"] > 0.01
-    assert state["nussbaum_gain"] == pytest.approx(1.0, abs=0.01)
-    assert b"beside the counted" in out
+    assert state["delta_2"] == pytest.approx(
+        0.0179, rel=0.02
+    )  # SOC below which C_tl is negative, of a10..a12 at their limits
+    assert state["nussbaum_gain"] == pytest.approx(1.0, abs=0.01)  # N(0) is 1, and k has hardly grown
+    assert re.search(rb"true SOC \d+\.\d\d%, by coulomb counting \d+\.\d\d%; observer", out)
 
 
 @pytest.mark.thorough
@@ -116,9 +119,10 @@ async def test_estimate_follows_a_demo_that_runs_faster_than_the_wall_clock():
     assert state["lock"] is True
 
 
-def test_occupied_port_is_reported(capsys):
+@pytest.mark.parametrize("option", ["--port", "--page-port"])
+def test_occupied_port_is_reported_with_its_option(capsys, option):
     with socket.create_server(("127.0.0.1", 0)) as occupant:
         port = occupant.getsockname()[1]
-        code, _, err = run(capsys, "demo", "--seconds", 1, "--port", port)
+        code, _, err = run(capsys, "demo", "--seconds", 1, option, port)
     assert code == 2
-    assert err.splitlines()[-1].startswith(f"error: port {port}: taken by another program")
+    assert err.endswith(f"error: port {port}: in use or not permitted; without {option} a free port is chosen\n")

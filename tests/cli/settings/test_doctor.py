@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.settings.doctor import load_subject
+from bms_estimator.cli.settings.doctor import load_examined_settings
 from bms_estimator.doctor.finding import Finding
 from tests.command_line import run
 from tests.doctor.as_user import as_nobody
@@ -93,6 +93,6 @@ def test_settings_that_only_root_can_read_need_sudo(tmp_path: Path, monkeypatch:
     tmp_path.chmod(0o755)
     file.touch(mode=0o000)
     monkeypatch.chdir(tmp_path)  # the user nobody has no access to the parents of this folder
-    finding = as_nobody(lambda: load_subject(Path("pack.toml")))
+    finding = as_nobody(lambda: load_examined_settings(Path("pack.toml")))
     assert isinstance(finding, Finding)
     assert finding.remedy == f"sudo {Path(sys.executable).parent}/bms-estimator doctor pack.toml"

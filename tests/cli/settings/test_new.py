@@ -23,7 +23,7 @@ from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial.device_detection import BoardClient
 from tests.command_line import PROGRAM, run
 from tests.device_line import running_device
-from tests.mosquitto import PASSWORD, Broker, closed_broker
+from tests.mosquitto import PASSWORD, Broker, password_broker
 from tests.patience import LONG_S
 from tests.pseudo_terminal import PseudoTerminal
 from tests.simavr_board import SimavrBoard, write_readings
@@ -252,7 +252,9 @@ def test_the_zero_of_a_bms_is_written_with_its_sign(file, capsys, long_timeouts)
     with running_device(jk_bms(current_a=0.3)) as path:
         code, _, err = run(capsys, "new", file, "--device", path, *options(), "--zero", "--yes", "--no-estimate")
     assert (code, err) == (0, "")
-    assert load_settings(file).sensor.current_zero_a == pytest.approx(-0.3)
+    assert load_settings(file).sensor.current_zero_a == pytest.approx(
+        -0.3
+    )  # in the sign of a JK-BMS, which reports charge as positive
 
 
 @pytest.mark.usefixtures("firmware")
@@ -279,7 +281,7 @@ def read_hello(path: str) -> Hello:
 @pytest.fixture
 def node_broker(tmp_path: Path) -> Iterator[Broker]:
     """Broker with a password, to which a simulated ESPHome node publishes."""
-    broker = closed_broker(tmp_path).start()
+    broker = password_broker(tmp_path).start()
     (tmp_path / "node-password").write_text(PASSWORD)
     mqtt = MqttSettings(url=broker.url, username="owner", password_file=tmp_path / "node-password")
     node = SimulatedNode(lambda _: Reading(5.0, 52.8, 21.0), cells=16, mqtt=mqtt, speed=10.0)

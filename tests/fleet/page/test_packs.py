@@ -37,13 +37,13 @@ def test_pack_without_a_state_or_with_none_for_three_minutes_is_silent():
     overview = packs.overview(100.0 + ALIVE_S - 1.0, 0.0)
     assert overview["packs"] == {"known": 3, "alive": 1, "silent": 2, "unlisted": 0, "uncertain": 0}
     assert overview["concerns"]["silent"]["packs"] == [["c", None], ["a", 279.0]]
-    assert overview["attention"] == 2
+    assert overview["attention_count"] == 2
 
 
 def test_pack_is_not_silent_within_three_minutes_after_the_start_of_the_page():
     packs = receive_states({"a": healthy()})
     overview = packs.overview(1000.0, 1000.0 - ALIVE_S)
-    assert (overview["packs"]["alive"], overview["packs"]["silent"], overview["attention"]) == (0, 0, 0)
+    assert (overview["packs"]["alive"], overview["packs"]["silent"], overview["attention_count"]) == (0, 0, 0)
 
 
 def test_pack_outside_the_table_counts_after_its_first_state_and_a_removed_pack_does_not():
@@ -106,13 +106,13 @@ def test_packs_with_concerns_are_ranked_and_count_once_for_attention():
     assert [name for name, _ in concerns["margin"]["packs"]] == ["low", "lower", "wide", "healthy"]
     assert concerns["soc"]["packs"][0] == ["lower", 0.02]
     assert concerns["suspects"]["packs"] == [["wide", "sign of current, capacity"], ["healthy", "ocv"]]
-    assert overview["attention"] == 4
+    assert overview["attention_count"] == 4
 
 
 def test_uncertain_packs_of_a_new_fleet_are_counted_and_need_no_attention():
     packs = receive_states({f"p{n}": healthy(soc_std=0.09) for n in range(133)} | {"known": healthy()})
     overview = packs.overview(1.0, 0.0)
-    assert (overview["packs"]["uncertain"], overview["attention"]) == (133, 0)
+    assert (overview["packs"]["uncertain"], overview["attention_count"]) == (133, 0)
 
 
 def test_only_the_packs_with_the_lowest_soc_are_listed():
@@ -195,7 +195,7 @@ def test_partitions_that_all_workers_refuse_and_packs_with_dead_letters_are_name
     assert overview["refused"] == [0, 1]
     assert overview["workers"][0]["refused"] == [[0, 3], [1, 3]]
     assert overview["concerns"]["dead"] == {"count": 2, "packs": (("x", "version 2"),)}
-    assert overview["attention"] == 2
+    assert overview["attention_count"] == 2
     view.receive_worker(heartbeat("later", 0).model_dump_json().encode(), 1.0)
     assert view.overview(2.0, 0.0)["refused"] == [1]
 
@@ -222,8 +222,8 @@ def test_unknown_packs_are_listed_until_they_are_known_or_no_worker_has_any():
     view.receive_unknown("y", "")
     overview = view.overview(3.0, 0.0)
     assert overview["concerns"]["unknown"] == {"count": 7, "packs": [["y", ""], ["x", "no row"], ["held", ""]]}
-    assert overview["attention"] == 7
-    view.set_type("y", "lfp 1s1p")
+    assert overview["attention_count"] == 7
+    view.set_pack_type("y", "lfp 1s1p")
     assert len(view.overview(3.0, 0.0)["concerns"]["unknown"]["packs"]) == 2
     view.receive_worker(heartbeat("w", 0).model_dump_json().encode(), 4.0)
     assert view.overview(4.0, 0.0)["concerns"]["unknown"] == {"count": 0, "packs": []}
@@ -236,7 +236,7 @@ def test_packs_with_a_wrong_clock_are_listed_with_the_largest_errors_first():
         view.receive_worker(beat.model_dump_json().encode(), 0.0)
     overview = view.overview(1.0, 0.0)
     assert overview["concerns"]["clock"] == {"count": 6, "packs": [["b", -4e8], ["a", 900.0]]}
-    assert overview["attention"] == 6
+    assert overview["attention_count"] == 6
 
 
 def test_rate_of_received_states_is_measured():

@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.estimator.estimator import make_estimator
-from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES, make_streams, pack_blocks
+from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES, make_streams, max_blocks_of_pack
 from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.worker.block_order import MAX_EARLY_REPEATS
@@ -93,7 +93,7 @@ async def test_blocks_of_an_attacker_evict_no_block_of_another_pack(fleet: Tenan
             await edge.publish("raw/attacker", junk, qos=1)
         await edge.publish("raw/attacker", b"last", qos=1)
     counts = await stored_counts(reader, b"last")
-    assert counts == {subject("honest"): 5, subject("attacker"): pack_blocks(RAW_BYTES)}
+    assert counts == {subject("honest"): 5, subject("attacker"): max_blocks_of_pack(RAW_BYTES)}
     await reader.close()
 
 

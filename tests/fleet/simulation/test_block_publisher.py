@@ -41,7 +41,9 @@ async def send_blocks(url: str, mqtt: str) -> tuple[Report, Counter[tuple[str, i
         run_edges(fleet, edges, MqttSettings(url=mqtt), connections=2, stop=stop, report=str, quiet_s=LONG_S)
     )
     first_pack = fleet.names[0]
-    request = BlockRequest(store=int(fleet.store[0]), number=RESENT_NUMBER, resend=True).model_dump_json().encode()
+    request = (
+        BlockRequest(store=int(fleet.store_created_ns[0]), number=RESENT_NUMBER, resend=True).model_dump_json().encode()
+    )
 
     async def receive_one(timeout_s: float) -> None:
         message = await arrivals.next_msg(timeout=timeout_s)

@@ -30,7 +30,7 @@ def test_block_depends_only_on_seed_pack_and_number() -> None:
         900,
         1,
         BLOCK_S,
-        fleet(8).store[6],
+        fleet(8).store_created_ns[6],
     )
     assert next(fleet(8, seed=2).blocks(pack_6, np.array([900]), arrival_s[:1])) != alone
 
@@ -56,7 +56,7 @@ def test_charge_of_the_samples_agrees_with_the_change_of_the_true_soc() -> None:
     assert charge_as / simulated.truth.capacity_as == pytest.approx(socs[0] - socs[1], abs=2e-4)
 
 
-def test_estimator_with_the_settings_of_the_table_converges_to_the_true_soc() -> None:
+def test_estimator_with_the_settings_of_each_kind_of_pack_converges_to_the_true_soc() -> None:
     simulated = fleet(len(KINDS))
     is_inside_band = []
     for pack, kind in enumerate(KINDS):
@@ -72,12 +72,13 @@ def test_estimator_with_the_settings_of_the_table_converges_to_the_true_soc() ->
     assert np.mean(is_inside_band) > 0.9
 
 
-def test_edges_send_the_blocks_that_are_complete_once_and_the_oldest_first() -> None:
+def test_edges_send_each_complete_block_once_and_the_oldest_first() -> None:
     simulated = fleet(50)
     edges = SimulatedEdges(simulated, start_s=1000.0, speed=60.0)  # a block of a minute takes one second
     assert edges.due(1000.9, 100).packs.size == 0
     first_due = edges.due(1003.0, 7)
     assert first_due.packs.size == 7
+    # the oldest unsent block was completed after those that were sent
     assert edges.lag_s(1003.0) <= 1003.0 - first_due.arrival_s.max()
     remaining = edges.due(1003.0, 100)
     assert set(remaining.packs[remaining.numbers == 1]) | set(first_due.packs) == set(range(50))
@@ -92,7 +93,7 @@ def test_edges_resend_from_the_requested_block() -> None:
         pass
     assert edges.done
     assert edges.sent == 8
-    store = int(simulated.store[1])
+    store = int(simulated.store_created_ns[1])
     assert not edges.receive_reply("someone-else", BlockRequest(store=store, number=2, resend=True), 0.0)
     assert not edges.receive_reply(simulated.names[1], BlockRequest(store=store + 1, number=2, resend=True), 0.0)
     assert edges.receive_reply(simulated.names[1], BlockRequest(store=store, number=3, resend=True), 0.0)
@@ -110,6 +111,8 @@ def test_edges_resend_from_the_requested_block() -> None:
 def test_edge_does_not_send_confirmed_blocks() -> None:
     simulated = fleet(1)
     edges = SimulatedEdges(simulated, start_s=0.0, speed=60.0)
-    edges.receive_reply(simulated.names[0], BlockRequest(store=int(simulated.store[0]), number=40, resend=False), 0.0)
+    edges.receive_reply(
+        simulated.names[0], BlockRequest(store=int(simulated.store_created_ns[0]), number=40, resend=False), 0.0
+    )
     assert edges.due(30.0, 10).packs.size == 0
     assert edges.due(41.0, 10).numbers.tolist() == [40]

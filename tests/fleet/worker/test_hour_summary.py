@@ -9,7 +9,7 @@ import pytest
 from bms_estimator import Estimator, load_cell
 from bms_estimator.edge.block import Block
 from bms_estimator.fleet.worker.hour_summary import HOUR_SUMS, Hour, add, begin, hour_of, row
-from bms_estimator.model.pack_model import load_any
+from bms_estimator.model.pack_model import load_model
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings
@@ -147,7 +147,7 @@ def test_dropped_samples_are_counted_and_unknown_values_are_none():
 def test_row_of_a_fuel_cell_has_no_soc_and_capacity():
     samples = np.zeros(60, SAMPLE)
     samples["time_s"], samples["voltage_v"], samples["current_a"] = range(60), 30.0, 1.0
-    sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_any("pem_30w"))
+    sums, estimator = np.zeros(1, HOUR_SUMS), Estimator(load_model("pem_30w"))
     add(sums, estimator.run(samples), samples.size, STORE_ID_NS, estimator)
     summary = json.loads(row(PACK, 1, sums, estimator).model_dump_json())
     assert (summary["soc"], summary["capacity_ah"], summary["soc_std"]) == (None, None, None)

@@ -21,7 +21,7 @@ from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, MAX_EARLY_REPE
 from bms_estimator.fleet.worker.block_processor import MAX_PART_SAMPLES, BlockProcessor
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.pack_model import load_any
+from bms_estimator.model.pack_model import load_model
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import ParameterReport
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
@@ -340,7 +340,7 @@ class TestPublishedMessages:
         assert stream.partition.counters["dropped_samples"] == 20
 
     def test_states_of_a_fuel_cell_and_of_a_pack_without_identifier_are_published(self, samples) -> None:
-        cell = load_any("pem_30w")
+        cell = load_model("pem_30w")
         without_identifier = Settings(identifier=IdentifierSettings(enabled=False))
         packs = {"stack": (Settings(), cell), "plain": (without_identifier, CELL)}
         stream = Stream(Partition(5, packs.get))

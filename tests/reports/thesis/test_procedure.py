@@ -14,7 +14,7 @@ import pytest
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.thesis.experiment import CLAIMS, Claim, Experiment, Recorded, Result, claim
-from bms_estimator.reports.thesis.experiment_figures import FIGURES
+from bms_estimator.reports.thesis.experiment_figures import FIGURES, MAX_LOADS, constant_loads, step_loads
 from bms_estimator.reports.thesis.procedure import Capture, Kind, Procedure, kind_of, printed_bounds
 from bms_estimator.reports.thesis.report_items import Reproduction
 from bms_estimator.sources.captures.replay import load_capture
@@ -56,6 +56,11 @@ def leaf_procedure(data):
     hppc, cc = (load_capture(data / "leaf" / f"{name}.csv.gz").rows for name in ("hppc_25c_from_full", "cc_1c"))
     captures = [Capture("hppc", Kind.RELAXATION, hppc), Capture("cc", Kind.CONSTANT, chapter5.discharge(cc, 0.3))]
     return Procedure(load_cell("leaf"), captures, 1e-3)
+
+
+def test_a_constant_load_beyond_the_number_of_plots_is_not_drawn_as_a_step(samples):
+    procedure = make_procedure(samples | {f"constant {i}": samples["constant"] for i in range(MAX_LOADS)})
+    assert (len(constant_loads(procedure)), step_loads(procedure)) == (MAX_LOADS, ["steps"])
 
 
 @pytest.mark.parametrize("noise_a", [0.0, 0.01, 0.05])

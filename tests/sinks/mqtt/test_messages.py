@@ -70,7 +70,7 @@ def test_unchanged_messages_are_not_repeated():
 def test_new_health_is_published():
     _, published = MESSAGES.live_messages(PublishedState(), CELL_SNAPSHOT, NOW)
     messages, _ = MESSAGES.live_messages(published, snapshot()._replace(forecast=CELL_SNAPSHOT.forecast), NOW + 1.0)
-    assert topics(messages) == ["parameters", "health"]
+    assert topics(messages) == ["parameters", "health"]  # the estimate, which contains the parameters, is new, too
 
 
 def test_a_forecast_is_published_once():
@@ -99,8 +99,8 @@ def test_parameters_are_published_from_the_first_sample_on():
 
 def test_availability_messages_repeat_the_availabilities_published_last():
     _, silent = MESSAGES.live_messages(PublishedState(), snapshot(sensor_message="no board"), NOW)
-    correct = {m.topic: m.payload for m in MESSAGES.availability(silent)}
-    assert correct == {"bms/pack/availability": b"online", "bms/pack/sensor/availability": b"offline"}
+    payloads = {m.topic: m.payload for m in MESSAGES.availability(silent)}
+    assert payloads == {"bms/pack/availability": b"online", "bms/pack/sensor/availability": b"offline"}
     assert topics(MESSAGES.availability(PublishedState())) == ["availability"]
 
 

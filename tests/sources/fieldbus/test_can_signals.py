@@ -72,46 +72,50 @@ def source(**options: object) -> CanSource:
 
 
 @given(st.lists(st.tuples(st.sampled_from([0x355, 0x356, 0x357]), st.booleans(), st.binary(max_size=64)), max_size=20))
-def test_no_frames_raise_an_error_with_a_profile(frames: list[tuple[int, bool, bytes]]) -> None:
-    can_map = CanDecoder(source(profile="pylontech-can"))
+def test_arbitrary_frames_raise_no_error_with_a_profile(frames: list[tuple[int, bool, bytes]]) -> None:
+    decoder = CanDecoder(source(profile="pylontech-can"))
     for identifier, extended, data in frames:
-        reading = can_map.feed(0.0, identifier, extended, data)
+        reading = decoder.feed(0.0, identifier, extended, data)
         assert (reading is not None) == ((identifier, extended) == (0x356, False) and len(data) >= 4)
 
 
 @given(st.lists(st.tuples(st.sampled_from([0x500, 0x501]), st.binary(max_size=64)), max_size=20))
-def test_no_frames_raise_an_error_with_a_dbc_file(dbc_source: CanSource, frames: list[tuple[int, bytes]]) -> None:
-    can_map = CanDecoder(dbc_source)
+def test_arbitrary_frames_raise_no_error_with_a_dbc_file(
+    dbc_source: CanSource, frames: list[tuple[int, bytes]]
+) -> None:
+    decoder = CanDecoder(dbc_source)
     for identifier, data in frames:
-        can_map.feed(0.0, identifier, extended=False, data=data)
+        decoder.feed(0.0, identifier, extended=False, data=data)
 
 
 def test_only_the_frame_of_the_profile_is_decoded() -> None:
     source_settings = source(profile="pylontech-can")
     resolutions = {"voltage_resolution_v": 0.01, "current_resolution_a": 0.1}
     assert source_settings.sensor_defaults == {"current_sign": "charge_positive", **resolutions}
-    can_map = CanDecoder(source_settings)
-    assert can_map.frame_ids == (FrameId(0x356, False), FrameId(0x355, False))
-    assert can_map.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
-    assert can_map.feed(0.0, 0x355, extended=False, data=bytes([62, 0, 99, 0])) is None
-    reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA)
+    decoder = CanDecoder(source_settings)
+    assert decoder.frame_ids == (FrameId(0x356, False), FrameId(0x355, False))
+    assert decoder.missing == "source.voltage (frame 0x356), source.current (frame 0x356)"
+    assert decoder.feed(0.0, 0x355, extended=False, data=bytes([62, 0, 99, 0])) is None
+    reading = decoder.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA)
     assert reading is not None
     assert reading[:4] == (52.34, -12.3, (21.5,), ())
     assert reading.soc == 0.62
 
 
 def test_truncated_frame_gives_the_values_that_it_contains() -> None:
-    can_map = CanDecoder(source(profile="pylontech-can"))
-    reading = can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:4])
+    decoder = CanDecoder(source(profile="pylontech-can"))
+    reading = decoder.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:4])
     assert reading is not None
     assert reading[:2] == (52.34, -12.3)
     assert math.isnan(*reading.temperatures_c)
-    assert can_map.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:2]) is None
-    assert can_map.counters["short_frames"] == 2
+    assert decoder.feed(0.0, 0x356, extended=False, data=PYLONTECH_DATA[:2]) is None
+    assert decoder.counters["short_frames"] == 2
 
 
-def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent_other_values(dbc_path: Path) -> None:
-    can_map = CanDecoder(
+def test_voltage_and_current_of_a_reading_are_of_about_the_same_time_and_other_values_are_recent(
+    dbc_path: Path,
+) -> None:
+    decoder = CanDecoder(
         source(
             dbc=str(dbc_path),
             voltage={"signal": "Volts"},
@@ -123,12 +127,12 @@ def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent
     volts, amperes, degrees, two_cells = 1, 2, 3, 4  # identifiers of the frames; each byte is in units of 0.1
 
     def feed(arrival_s: float, identifier: int, data: bytes) -> Reading | None:
-        return can_map.feed(arrival_s, identifier, extended=False, data=data)
+        return decoder.feed(arrival_s, identifier, extended=False, data=data)
 
     assert feed(0.0, degrees, b"\xd2") is None
     assert feed(0.0, two_cells, b"\x20\x21") is None
     assert feed(0.0, amperes, b"\x05") is None
-    assert can_map.missing == "source.voltage (frame 0x001)"
+    assert decoder.missing == "source.voltage (frame 0x001)"
     reading = feed(1.0, volts, b"\x82")
     assert reading is not None
     assert reading[:3] == (13.0, 0.5, (21.0,))
@@ -136,7 +140,7 @@ def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent
     assert math.isnan(reading.cells_v[2])
     assert feed(2.0, volts, b"\x83") is None
     assert feed(2.0, amperes, b"\xff") is None  # 25.5 A means that the current is not measured
-    assert can_map.counters["not_measured"] == 1
+    assert decoder.counters["not_measured"] == 1
     assert feed(3.0, volts, b"\x83") is None
     assert feed(6.1, amperes, b"\x05") is None  # voltage and current are more than three periods apart
     assert feed(7.0, volts, b"\x83") is None
@@ -151,17 +155,17 @@ def test_reading_needs_voltage_and_current_of_about_one_time_and_contains_recent
 
 
 def test_signals_of_a_dbc_file_are_decoded(dbc_source: CanSource) -> None:
-    can_map = CanDecoder(dbc_source)
-    assert set(can_map.frame_ids) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
-    assert can_map.feed(0.0, 0x18FF0000, extended=True, data=bytes([1, 65])) is None
-    assert can_map.feed(0.0, 0x501, extended=False, data=bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
-    assert can_map.feed(0.0, 0x501, extended=False, data=bytes([1, 0xE6, 0x0C])) is None
-    assert can_map.counters["short_frames"] == 0  # a multiplexed frame contains only some of the signals
+    decoder = CanDecoder(dbc_source)
+    assert set(decoder.frame_ids) == {FrameId(0x500, False), FrameId(0x501, False), FrameId(0x18FF0000, True)}
+    assert decoder.feed(0.0, 0x18FF0000, extended=True, data=bytes([1, 65])) is None
+    assert decoder.feed(0.0, 0x501, extended=False, data=bytes([0, 0xE4, 0x0C, 0xE5, 0x0C])) is None
+    assert decoder.feed(0.0, 0x501, extended=False, data=bytes([1, 0xE6, 0x0C])) is None
+    assert decoder.counters["short_frames"] == 0  # a multiplexed frame contains only some of the signals
     assert (
-        can_map.feed(0.0, 0x501, extended=False, data=bytes([7, 0, 0])) is None
+        decoder.feed(0.0, 0x501, extended=False, data=bytes([7, 0, 0])) is None
     )  # no signal has the multiplexer value 7
-    assert can_map.counters["short_frames"] == 1
-    reading = can_map.feed(0.0, 0x500, extended=False, data=(4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
+    assert decoder.counters["short_frames"] == 1
+    reading = decoder.feed(0.0, 0x500, extended=False, data=(4001).to_bytes(2, "big") + (10123).to_bytes(2, "big"))
     assert reading is not None
     assert reading[:4] == (400.1, 12.3, (25.0,), (3.3, 3.301, 3.302))
 

@@ -80,7 +80,7 @@ function drawStatus() {
 
 function tile(id, state) { attribute($(id), "class", `card ${state}`); }
 
-function drawTiles({ packs, holders, unheld, twice, refused, lag_s, workers, states_per_s, concerns, attention, listening_s }) {
+function drawTiles({ packs, holders, unheld, twice, refused, lag_s, workers, states_per_s, concerns, attention_count, listening_s }) {
 	const missing = packs.known - packs.alive, unsure = missing - packs.silent;
 	put("alive", count(packs.alive));
 	put("known", `of ${count(packs.known)}`);
@@ -100,7 +100,7 @@ function drawTiles({ packs, holders, unheld, twice, refused, lag_s, workers, sta
 	tile("lag", !f.isNumber(lag_s) ? "" : lag_s > MAX_LAG_S ? "wrong" : "fine");
 
 	const present = KINDS.filter(([kind]) => concerns[kind]?.count).map(([kind, name]) => [concerns[kind].count, name]);
-	put("attention", count(attention));
+	put("attention", count(attention_count));
 	put("attentionwhy", present.length ? present.sort((a, b) => b[0] - a[0]).map(([n, name]) => `${count(n)} ${name.toLowerCase().replace("soc", "SOC")}`).join(" · ") : "no pack does");
 	tile("attention", concerns.margin?.count || concerns.suspects?.count ? "wrong" : present.length ? "low" : "fine");
 }

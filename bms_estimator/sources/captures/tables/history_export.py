@@ -1,6 +1,6 @@
 """Reader of histories in long form, such as that of Home Assistant. It chooses the entities of a battery.
 
-Samples from voltages and currents that change at different times, with values held between the changes.
+Voltage and current change at different times. A sample has the last value of each.
 """
 
 import re

@@ -10,7 +10,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-class DiskThread(Executor):
+class DaemonThreadExecutor(Executor):
     """Executor that runs calls one after the other in a daemon thread.
 
     The process can exit while a call hangs, unlike with ``ThreadPoolExecutor``.
