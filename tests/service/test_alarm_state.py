@@ -392,6 +392,7 @@ def copy_from_another_pack(folder: Path) -> None:
     another = StateFiles(folder, edit_settings("pack", name="another"), CELL).run_file
     another.save(another.load().counters)
     another.path.replace(folder / "pack.run")
+    os.utime(folder / "pack.run", (5e9, 5e9))  # newer than the checkpoint, which alone would also be a reason
 
 
 def interrupt_quarantine(folder: Path) -> None:
