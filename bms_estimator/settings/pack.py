@@ -150,8 +150,7 @@ class BmsSettings(Strict):
     )
     source: SourceSettings | None = Field(
         default=None,
-        description="BMS that is not on a serial port, with the keys of [source]",
-        examples=['source = { kind = "mqtt", profile = "esphome-jk", prefix = "jk-bms" }'],
+        description='BMS that is not on a serial port, with the keys of [source], such as { kind = "mqtt", profile = "esphome-jk", prefix = "jk-bms" }',
     )
 
     @model_validator(mode="before")

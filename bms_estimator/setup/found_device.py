@@ -28,6 +28,10 @@ class FoundDevice:
     """Number of cells in series, if the device reports it."""
     voltage_v: float | None = None
     """Voltage that was received during the search [V]; None: none was received."""
+    soc: float | None = None
+    """SOC by the device, 0..1, that was received during the search; None: none was received."""
+    capacity_ah: float | None = None
+    """Capacity from which the device computes its SOC [Ah]; None: none was received."""
     values: str = ""
     """Values that were received during the search, as text; empty if the search received none."""
     broker: BrokerLogin | None = None
@@ -76,6 +80,8 @@ def _pair(monitor: FoundDevice, bms: FoundDevice) -> FoundDevice:
         description=f"{monitor.description}, with cells and temperatures of {bms.name}",
         tables={**monitor.tables, "bms": bms.tables},
         cells=bms.cells,
+        soc=bms.soc if monitor.soc is None else monitor.soc,
+        capacity_ah=bms.capacity_ah if monitor.capacity_ah is None else monitor.capacity_ah,
         values=monitor.values,
         broker=monitor.broker or bms.broker,
     )

@@ -105,7 +105,7 @@ def _templates() -> tuple[_Template, ...]:
 
 def _iter_templates() -> Iterator[_Template]:
     for name, profile in PROFILES.items():
-        for quantity in ("voltage", "current", "temperature", "cells"):
+        for quantity in ("voltage", "current", "temperature", "cells", "soc", "capacity"):
             if quantity not in profile.table:
                 continue
             tables = profile.table[quantity]
@@ -168,6 +168,8 @@ def _device(
         tables={"source": source},
         cells=cells or None,
         voltage_v=values["voltage"],
+        soc=values["soc"] / 100.0 if "soc" in values else None,
+        capacity_ah=values.get("capacity"),
         values=values_text(values["voltage"], sign * values["current"]),
         broker=broker,
     )

@@ -233,12 +233,13 @@ def _parse_device_soc_std(text: str, _: Answers) -> object:
 
 
 def _reports_soc(answers: Answers) -> bool:
-    return answers.measured is not None and answers.measured.soc is not None
+    return answers.device.soc is not None or (answers.measured is not None and answers.measured.soc is not None)
 
 
 def _suggest_capacity(answers: Answers) -> str:
     """Return the capacity of the pack by the device, which is that of a cell unless cells are in parallel."""
-    capacity_ah = answers.measured.capacity_ah if answers.measured else None
+    measured_ah = answers.measured.capacity_ah if answers.measured else None
+    capacity_ah = answers.device.capacity_ah if measured_ah is None else measured_ah
     return "" if capacity_ah is None else f"{capacity_ah:g}"
 
 

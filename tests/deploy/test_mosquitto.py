@@ -152,7 +152,9 @@ def tls_port(find_program, deploy, tmp_path) -> Iterator[int]:
     mosquitto, passwd = find_program("mosquitto", "mosquitto"), find_program("mosquitto_passwd", "mosquitto")
     find_program("openssl", "openssl")
     commands = (
-        commands_of_page("Certificates", page="mosquitto").replace("broker.lan", "localhost").replace("house", "pack")
+        commands_of_page("Certificates", page="integrations")
+        .replace("broker.lan", "localhost")
+        .replace("house", "pack")
     )
     commands += "openssl req -x509 $new -subj /CN=pack -keyout stranger.key -out stranger.crt\n"
     subprocess.run(["bash", "-ec", commands], cwd=tmp_path, check=True, capture_output=True)

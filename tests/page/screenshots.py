@@ -39,7 +39,7 @@ from tests.store.test_history import record_history
 DOCS = Path(__file__).parents[2] / "docs" / "images"
 CELLS, CAPACITY_AH = 16, 280.0
 """Number of cells, and their capacity [Ah]."""
-STEP_S, LIVE_S = 10.0, 600.0
+STEP_S, LIVE_S = 60.0, 600.0
 """Interval of the samples, and duration at the end with a sample each second, which the live curves show [s]."""
 FULL_V = 3.42
 """Voltage of a cell above which the charger reduces its current [V]."""
@@ -146,8 +146,8 @@ async def shoot_first_day(folder: Path, browser: Browser) -> None:
 
 
 async def shoot_weeks(folder: Path, browser: Browser) -> None:
-    """Write screenshots of a pack after four days, discharging."""
-    async with House(4.0, 0.6, 20.0).page(folder) as url:
+    """Write screenshots of a pack after a month, discharging."""
+    async with House(30.0, 0.6, 20.0).page(folder) as url:
         async with open_page(browser, url) as page_tab:
             await shoot(page_tab, "desktop")
             await shoot(page_tab, "cells", ".cells")

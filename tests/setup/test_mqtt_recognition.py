@@ -74,6 +74,12 @@ def test_publishers_are_recognized_by_their_topics(
     assert device.settings.source
 
 
+def test_soc_and_capacity_of_a_bms_are_read() -> None:
+    reported = {"state_of_charge": "62", "total_battery_capacity_setting": "280"}
+    (device,) = find(JK_NODE | {f"home/jk/sensor/jk_{name}/state": text for name, text in reported.items()})
+    assert (device.soc, device.capacity_ah) == (0.62, 280.0)
+
+
 def test_cells_are_counted() -> None:
     (device,) = find(JK_NODE)
     assert device.cells == 2
