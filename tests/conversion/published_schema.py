@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from bms_estimator.conversion.cell_json import cell_schema
+from bms_estimator.conversion.json_and_pybamm import cell_schema
 
 FILE = Path(__file__).parents[2] / "docs" / "reference" / "cell.schema.json"
 

@@ -5,7 +5,7 @@ import json
 import jsonschema
 import pytest
 
-from bms_estimator.conversion.cell_json import CellDocument, cell_json, cell_schema
+from bms_estimator.conversion.json_and_pybamm import CellDocument, cell_json, cell_schema
 from bms_estimator.model.cell import generic_cells, load_cell, shipped_cells
 from tests.conversion.published_schema import FILE
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.conversion.cell_json import pybamm_module
+from bms_estimator.conversion.json_and_pybamm import pybamm_module
 from bms_estimator.model.cell import load_cell
 
 PAGE = (Path(__file__).parents[2] / "docs" / "cell" / "convert.md").read_text(encoding="utf-8")

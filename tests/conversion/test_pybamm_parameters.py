@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from bms_estimator.conversion.cell_json import pybamm_module
+from bms_estimator.conversion.json_and_pybamm import pybamm_module
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from tests.conversion.load import INITIAL_SOC, STEP_S, difference_mv, load_profile

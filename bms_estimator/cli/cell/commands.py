@@ -22,8 +22,8 @@ from bms_estimator.cli.options.capture_options import (
     write_cell_named_as_file,
 )
 from bms_estimator.cli.options.pack_options import load_pack, single_cell_of
-from bms_estimator.conversion.cell_json import cell_json, pybamm_module
 from bms_estimator.conversion.circuit import c_header
+from bms_estimator.conversion.json_and_pybamm import cell_json, pybamm_module
 from bms_estimator.estimator.identified_parameters import (
     fitted_ocv_correction,
     identified_cell,
