@@ -29,7 +29,7 @@ EMPTY_FALL = 0.01
 """A discharge ends empty if the voltage falls by more than this fraction of its median while the last 1 % of the charge is
 drawn."""
 MAX_BEFORE_FRACTION = 0.01
-"""Maximum net charge drawn, or charged, before a discharge that measures the capacity, as a fraction of its charge."""
+"""Maximum net charge drawn before a discharge that measures the capacity, or charged below full, as a fraction of its charge."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,9 @@ def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
         if branch.to_empty
         and branch.start.is_exact
         and branch.start.soc > 0.0
-        and abs(branch.before_ah) < MAX_BEFORE_FRACTION * branch.ah[-1]
+        # after a charge, the SOC is unknown unless the cell was full before and remains full
+        and (abs(branch.before_ah) if branch.start.soc < 1.0 else branch.before_ah)
+        < MAX_BEFORE_FRACTION * branch.ah[-1]
     ]
     if not known:
         return float("nan")

@@ -61,7 +61,7 @@ def test_columns_of_a_capture_can_be_named(tmp_path: Path) -> None:
             "time_s,voltage_v\n0,3.7\n",
             "needs time_s and exactly one of current_a and power_w; its columns are time_s, voltage_v",
         ),
-        ("time_s,current_a,power_w\n0,1,2\n1,2,3\n", "one column of the load"),
+        ("time_s,current_a,power_w\n0,1,2\n1,2,3\n", "exactly one of current_a and power_w"),
         ("time_s,power_w\n0,5\n1,x\n", "row 2: power_w = 'x': must be a number"),
         ("time_s,power_w\n0,5\n1\n", "row 2: 1 values, but the header has 2 columns"),
         ("time_s,power_w\n0,nan\n1,2\n", "point 1: power_w = nan: must be a number"),
