@@ -91,9 +91,7 @@ async def load_packs(nc: Client, packs: list[str]) -> PackRegistry:
 async def until_table(nc: Client, rows: Mapping[str, bytes]) -> None:
     """Wait until the table of packs consists of ``rows``."""
     async with asyncio.timeout(LONG_S):
-        while True:
-            if await read_bucket(nc, subjects.PACKS_BUCKET) == rows:
-                return
+        while await read_bucket(nc, subjects.PACKS_BUCKET) != rows:  # noqa: ASYNC110 - the server is asked
             await asyncio.sleep(0.1)
 
 

@@ -182,8 +182,6 @@ class Partition:
         if pack_type is None:
             is_block = not is_fit(data) and isinstance(self._decode(data), Block)
             return self.defer(pack, sequence) if is_block else BlockResult(pack)
-        if is_fit(data):
-            return self._receive_fit(pack, data, sequence, pack_type)
         return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def defer(self, pack: str, sequence: int) -> BlockResult:
@@ -206,8 +204,6 @@ class Partition:
         self.deferred.advance(pack, sequence)
         if is_change(data):
             return self._apply_change(pack, data)
-        if is_fit(data):
-            return self._receive_fit(pack, data, sequence, pack_type)
         return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def reject_misplaced(self, pack: str, sequence: int) -> BlockResult:
@@ -247,7 +243,9 @@ class Partition:
     def _decode_and_take(
         self, pack: str, data: bytes, arrival: Arrival, pack_type: PackType, *, is_lethal: bool
     ) -> BlockResult:
-        """Process a message of a known pack. Of a lethal block only the header is decoded."""
+        """Process a fit or a block of a known pack. Of a lethal block only the header is decoded."""
+        if is_fit(data):
+            return self._receive_fit(pack, data, arrival.sequence, pack_type)
         block = self._decode(data, decode_header if is_lethal else decode)
         if isinstance(block, BlockError):
             self._log_rejection(pack, str(block))

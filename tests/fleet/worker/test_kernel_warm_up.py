@@ -3,9 +3,6 @@
 import subprocess
 import sys
 
-from bms_estimator.fleet.worker import kernel_warm_up
-from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
-
 COUNT_SIGNATURES_SCRIPT = """
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.kernels import packed_record
@@ -16,19 +13,6 @@ kernels = [packed_record.pack, packed_record.unpack, run_cells]
 kernels += [charge_energy.accumulate_charge_energy, hour.accumulate_hour, publish_window.accumulate_window]
 print([len(kernel.signatures) for kernel in kernels])
 """
-
-
-def test_warm_up_processes_blocks_and_completes_an_hour(monkeypatch) -> None:
-    results, original_take = [], kernel_warm_up.Partition.take
-
-    def take(*args):
-        results.append(original_take(*args))
-        return results[-1]
-
-    monkeypatch.setattr(kernel_warm_up.Partition, "take", take)
-    load_fleet_kernels()
-    assert all(each.state and each.parameters for each in results)
-    assert len(results[-1].hours) == 1
 
 
 def test_each_kernel_is_compiled_for_one_signature() -> None:

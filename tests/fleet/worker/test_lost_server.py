@@ -1,16 +1,14 @@
 """Disk of the server that is lost while a worker lives: the worker saves its states and the table of packs on the new disk."""
 
 import asyncio
-import contextlib
 import shutil
 from pathlib import Path
 
-import nats.errors
 from nats.aio.client import Client
 
-from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
+from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
 from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.worker.checkpoint.admin_changes import read_pointers
 from tests.fleet.nats_cluster import connected, running
 from tests.fleet.partition_stream import estimates_of
 from tests.fleet.workers import (
@@ -62,11 +60,6 @@ async def test_worker_fills_the_buckets_of_a_new_disk_with_its_states_and_the_ta
 
 async def _until_saved(nc: Client) -> None:
     """Wait until the pointer of the partition names a checkpoint."""
-    bucket = await nc.jetstream().key_value(subjects.CHECKPOINTS_BUCKET)
     async with asyncio.timeout(LONG_S):
-        while True:
-            with contextlib.suppress(nats.errors.Error):  # no pointer yet
-                entry = await bucket.get(pointer_key(0))
-                if Pointer.model_validate_json(entry.value or b"").kept:
-                    return
+        while not (await read_pointers(nc)).get(0, Pointer()).kept:  # noqa: ASYNC110 - the server is asked
             await asyncio.sleep(0.1)
