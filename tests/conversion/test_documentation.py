@@ -1,4 +1,4 @@
-"""Python examples of docs/cell/convert.md."""
+"""Python examples of docs/cell/index.md."""
 
 import re
 import sys
@@ -9,7 +9,7 @@ import pytest
 from bms_estimator.conversion.json_and_pybamm import pybamm_module
 from bms_estimator.model.cell import load_cell
 
-PAGE = (Path(__file__).parents[2] / "docs" / "cell" / "convert.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "cell" / "index.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.thorough

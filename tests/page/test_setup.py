@@ -41,13 +41,13 @@ async def search_and_choose(page: Page, path: str) -> None:
     await page.get_by_role("button", name="Search", exact=True).click()
     await expect(page.get_by_role("button", name="Use this device")).to_be_visible()
     await page.get_by_role("button", name="Use this device").click()
-    await expect(page.get_by_text("26.40 V, 5.00 A, discharging")).to_be_visible()
+    await expect(page.get_by_text("52.80 V, 35.00 A, discharging")).to_be_visible()
 
 
 @pytest.mark.parametrize("size", [PHONE, pytest.param(DESKTOP, marks=pytest.mark.thorough)], ids=["phone", "desktop"])
 async def test_page_leads_from_the_search_to_the_first_estimate(tmp_path: Path, size: dict[str, int]) -> None:
     file = tmp_path / "house.toml"
-    bms = SimulatedBms("jk", lambda _: Reading(5.0, 26.4, 21.0), cells=8)
+    bms = SimulatedBms("jk", lambda _: Reading(35.0, 52.8, 21.0), cells=16)
     with running_device(bms) as path:
         async with (
             SetupServer(loopback(), file) as server,
@@ -57,7 +57,7 @@ async def test_page_leads_from_the_search_to_the_first_estimate(tmp_path: Path, 
             await search_and_choose(opened.page, path)
             await compare_voltage(opened.page)
             await answer_questions(opened.page)
-            await expect(opened.page.locator("[data-q=voltage]")).to_have_text("26.66")
+            await expect(opened.page.locator("[data-q=voltage]")).to_have_text("53.33")
             await expect(opened.page.locator("[data-q=soc]")).to_have_text(re.compile(r"^\d+\.\d$"))
             await expect(opened.page.get_by_text("A first estimate under load is inexact")).to_be_visible()
             await expect(opened.page.get_by_text(f"bms-estimator run {file}")).to_be_visible()
@@ -65,16 +65,16 @@ async def test_page_leads_from_the_search_to_the_first_estimate(tmp_path: Path, 
     assert overflow <= 0, "a part of the page is outside the screen"
     assert opened.errors == []
     settings = load_settings(file)
-    assert (settings.pack.name, settings.pack.cell, settings.pack.series) == ("house", "lfp", 8)
+    assert (settings.pack.name, settings.pack.cell, settings.pack.series) == ("house", "lfp", 16)
     assert settings.sensor.voltage_gain == pytest.approx(1.01)
 
 
 async def compare_voltage(page: Page) -> None:
     """Enter an impossible voltage, which is rejected with the reason, and then a possible one."""
-    await page.get_by_label("Voltage at the terminals").fill("2.64")
+    await page.get_by_label("Voltage at the terminals").fill("5.28")
     await page.get_by_role("button", name="Compare voltage").click()
     await expect(page.get_by_role("alert")).to_contain_text("differs by more than 20%")
-    await page.get_by_label("Voltage at the terminals").fill("26.664")
+    await page.get_by_label("Voltage at the terminals").fill("53.328")
     await page.get_by_role("button", name="Compare voltage").click()
     await expect(page.get_by_text("gain 1.0100")).to_be_visible()
     await page.get_by_role("button", name="Check the sign").click()
@@ -89,7 +89,7 @@ async def answer_questions(page: Page) -> None:
     await page.get_by_label("MQTT broker").fill("mqtt://localhost:99999")
     await page.get_by_role("button", name="Write").click()
     await expect(page.get_by_role("alert")).to_contain_text(["is it in mAh?", "Port out of range"])
-    await page.get_by_label("Capacity of one cell").fill("40 Ah")
+    await page.get_by_label("Capacity of one cell").fill("280 Ah")
     await page.get_by_label("MQTT broker").fill("none")
     await page.get_by_role("button", name="Write").click()
 

@@ -31,9 +31,10 @@ export function drawCurves(pack, span, onLoaded) {
 	const columns = live ? liveColumns(pack) : (past.columns ??= pastColumns(past.data));
 	const { time } = columns, end = live ? time.at(-1) ?? Date.now() / 1e3 : Date.now() / 1e3;
 	const from = live ? Math.max(end - SPANS.live, Math.min(time[0] ?? end, end - 30)) : end - SPANS[span];
+	// all are shown or hidden before the first is drawn, because this decides their widths
+	for (const [name, chart] of Object.entries(curves)) hide(chart.box, !columns[name]?.[2].some((v) => v !== null));
 	for (const [name, chart] of Object.entries(curves)) {
 		const drawn = columns[name];
-		hide(chart.box, !drawn?.[2].some((v) => v !== null));
 		if (drawn?.[3]) hide(chart.box.querySelector(".estimate"), !live);
 		if (!chart.box.hidden) chart.draw([time, ...drawn], from, end);
 	}
