@@ -14,7 +14,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from playwright.async_api import Browser
+from playwright.async_api import Browser, expect
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
@@ -33,6 +33,7 @@ from tests.device_line import running_device
 from tests.free_port import free_port
 from tests.page.chromium import DESKTOP, PHONE, Tab, chromium, tab
 from tests.page.test_setup import answer_questions, compare_voltage, search_and_choose
+from tests.patience import LONG_S
 from tests.scripted_source import ScriptedSource
 from tests.store.test_history import record_history
 
@@ -200,6 +201,7 @@ async def shoot_setup(folder: Path, browser: Browser) -> None:
 
 
 async def main() -> None:
+    expect.set_options(timeout=1e3 * LONG_S)  # for a busy machine
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         async with chromium() as browser:

@@ -229,7 +229,7 @@ async def test_collapse_risk_says_probability_and_time_left_and_does_not_depend_
     assert raised.value is not None
     assert raised.limit is not None
     assert raised.limit <= raised.value <= 1.0
-    assert f"{raised.value:.4g}, limit" in raised.text
+    assert f"{100.0 * raised.value:.4g} %, limit" in raised.text
     assert re.search(r"the time left was \d+ to \d+ min \(90 % band\)", raised.text)
     of_single_samples = await replayed(knee, settings(pack={}))
     assert of_single_samples.transitions("collapse_risk") == result.transitions("collapse_risk")

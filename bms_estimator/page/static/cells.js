@@ -29,11 +29,11 @@ export function drawCells(s) {
 	put("cellapart", f.millivolts(high - low));
 }
 
-/** Name the cell with the lowest SOC, and faulty cells. */
-export function drawRanks(report) {
+/** Name the cell with the lowest SOC, its capacity once that of the pack is learned, and faulty cells. */
+export function drawRanks(report, capacity) {
 	const cells = Array.isArray(report?.cells) ? report.cells.filter((c) => f.isNumber(c?.soc)) : [];
 	hide(document.querySelector("[data-of=weakestcell]"), !cells.length);
 	if (!cells.length) return;
 	const weakest = cells.reduce((a, b) => (b.soc < a.soc ? b : a)), faults = cells.filter((c) => c.fault).map((c) => `cell ${c.number}: ${c.fault}`);
-	put("weakestcell", [`cell ${weakest.number}, SOC ${f.percent(weakest.soc)} ± ${f.percent(2 * weakest.soc_std)} %, capacity ${f.percent(weakest.capacity_ratio, 0)} % of the others`, ...faults].join("; "));
+	put("weakestcell", [`cell ${weakest.number}, SOC ${f.percent(weakest.soc)} ± ${f.percent(2 * weakest.soc_std)} %${capacity?.valid ? `, capacity ${f.percent(weakest.capacity_ratio, 0)} % of the others` : ""}`, ...faults].join("; "));
 }

@@ -34,10 +34,11 @@ function draw() {
 	drawHead(pack);
 	showWhatIf(connection.broker || !f.isNumber(state.soc) || state.soc_known === false ? null : pack.name); // a dashboard, which has a link to a broker, makes no forecasts
 	drawAlarms(pack);
-	drawState(state, pack.topics.parameters?.state_of_health?.capacity);
+	const capacity = pack.topics.parameters?.state_of_health?.capacity;
+	drawState(state, capacity);
 	drawForecastValues(state);
 	drawCells(state);
-	drawRanks(pack.topics.cells);
+	drawRanks(pack.topics.cells, capacity);
 	drawParameters(pack.topics.parameters);
 	drawHealth(pack);
 	drawEvents(pack);
