@@ -167,7 +167,7 @@ class CellEstimator:
         bank = self.bank[0]
         mean, variance = self.cells["mean"], np.diagonal(self.cells["covariance"], axis1=1, axis2=2)
         std = np.sqrt(np.maximum(variance, 0.0))
-        std[:, SOC] = np.hypot(std[:, SOC], self._systematic_soc_std)
+        std[:, SOC] = np.sqrt(std[:, SOC] ** 2 + self._systematic_soc_std**2)
         capacity_ah = float(self._estimator.settings["capacity_as"][0]) / 3600.0
         deviation = mean[:, SOC] - mean[:, SOC].mean()
         resistance, capacity = 1.0 + mean[:, RESISTANCE], 1.0 / np.maximum(1.0 + mean[:, CAPACITY], 0.1)
@@ -175,7 +175,7 @@ class CellEstimator:
         return CellDeviations(
             at_s=float(bank["time_s"]),
             soc=np.clip(bank["soc"] + deviation, 0.0, 1.0),
-            soc_std=np.hypot(std[:, SOC], pack_std),
+            soc_std=np.sqrt(std[:, SOC] ** 2 + pack_std**2),
             soc_deviation=deviation,
             soc_deviation_std=std[:, SOC],
             resistance_ratio=resistance / np.median(resistance),

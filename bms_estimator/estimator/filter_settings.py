@@ -115,7 +115,7 @@ def filter_settings(
 
 def _noise(cell: CellModel, identifier: IdentifierSettings, sampling: Sampling, file_r_std: float) -> Noise:
     """Return the uncertainties of cell and source. ``file_r_std`` is the std of ln R in the cell file."""
-    r_std = float(np.hypot(file_r_std, sampling.current_gain_std))
+    r_std = math.sqrt(file_r_std**2 + sampling.current_gain_std**2)
     noise = Noise(r_std=r_std)
     if identifier.current_offset_std_a is not None:
         noise = replace(noise, offset_c=identifier.current_offset_std_a / cell.cell.capacity_ah)
@@ -126,7 +126,7 @@ def _noise(cell: CellModel, identifier: IdentifierSettings, sampling: Sampling, 
     return replace(
         noise,
         # a gain error of the current sensor has the same effect as an error of the capacity
-        capacity_std=float(np.hypot(noise.capacity_std, sampling.current_gain_std)),
+        capacity_std=math.sqrt(noise.capacity_std**2 + sampling.current_gain_std**2),
         bias_relative=max(noise.bias_relative, MIN_BIAS_OF_R_STD * r_std),
     )
 
@@ -154,7 +154,7 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
     radians = np.abs(np.gradient(np.arctan(slope_v / (KNEE_V * series)), SOC_GRID))
     p["curve_soc"] = 1.0 / (1.0 / CURVE_SOC + KNEE_DECORRELATION * radians)
     slope_v = np.minimum(slope_v, MAX_SLOPE_V * series)
-    p["curve_error_v"] = np.hypot(CURVE_ERROR_V * series, CURVE_ERROR_SOC * slope_v)
+    p["curve_error_v"] = np.sqrt((CURVE_ERROR_V * series) ** 2 + (CURVE_ERROR_SOC * slope_v) ** 2)
     is_mean_curve = False
     if isinstance(ocv, TableOcv):
         is_mean_curve = ocv.hysteresis_v is not None
@@ -163,7 +163,7 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
             if column is not None:
                 p["curve_error_v" if name == "error_v" else name] = np.interp(SOC_GRID, ocv.soc, column)
         if ocv.error_v is not None:
-            p["curve_error_v"] = np.hypot(p["curve_error_v"], COUNT_ERROR_SOC * slope_v)
+            p["curve_error_v"] = np.sqrt(p["curve_error_v"] ** 2 + (COUNT_ERROR_SOC * slope_v) ** 2)
     has_plateau = slope_v.min() < PLATEAU_SLOPE_V * series
     if np.median(slope_v) < PLATEAU_SLOPE_V * series:
         p["constant_error_v"] = math.sqrt(max(p["curve_error_v"].min() ** 2 - (MEASURED_STD_V * series) ** 2, 0.0))
@@ -187,8 +187,8 @@ def _add_voltage_gain_error(p: np.void, gain_std: float) -> None:
     """
     ocv_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_v"].size), p["ocv_v"])
     p["varying_error_v"] = np.sqrt(p["curve_error_v"] ** 2 - p["constant_error_v"] ** 2)
-    p["constant_error_v"] = np.hypot(p["constant_error_v"], gain_std * ocv_v)
-    p["curve_error_v"] = np.hypot(p["curve_error_v"], gain_std * ocv_v)
+    p["constant_error_v"] = np.sqrt(p["constant_error_v"] ** 2 + (gain_std * ocv_v) ** 2)
+    p["curve_error_v"] = np.sqrt(p["curve_error_v"] ** 2 + (gain_std * ocv_v) ** 2)
     p["voltage_gain_std"] = gain_std
 
 

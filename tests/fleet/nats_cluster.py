@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -89,11 +89,17 @@ class NatsCluster:
         assert process
         return process.pid
 
-    def start(self, i: int, *, wait: bool = True) -> None:
-        """Start node ``i`` with its stored streams; return when it is ready, or at once if not ``wait``."""
+    def start(self, i: int, *, wait: bool = True, prefix: Sequence[str] = ()) -> None:
+        """Start node ``i`` with its stored streams; return when it is ready, or at once if not ``wait``.
+
+        Args:
+            i: Number of the node.
+            wait: True: wait until the node is ready.
+            prefix: Command that runs the program, with its arguments.
+        """
         self.conf(i).write_text(configuration(self.nodes[i]))
         with self.log(i).open("ab") as log:
-            self._processes[i] = subprocess.Popen([BINARY, "-c", self.conf(i)], stderr=log)
+            self._processes[i] = subprocess.Popen([*prefix, BINARY, "-c", self.conf(i)], stderr=log)
         if wait:
             self.wait_ready(i)
 

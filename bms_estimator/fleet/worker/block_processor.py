@@ -95,9 +95,9 @@ class BlockProcessor:
             self._fits.use_curves(pack, pack_type)
         self._fits.begin_block(pack, pack_type, arrival.sequence)
         self._load_cells(pack_type)
-        rows, is_new_hour = self._roll_over_hour(pack, block, arrival, pack_type)
-        self._check_clock(block, arrival)
         is_new_time_base = int(self._delivery[LAST_STORE_NS]) != block.store_created_ns
+        rows, is_new_hour = self._roll_over_hour(pack, block, arrival, pack_type, is_new_time_base=is_new_time_base)
+        self._check_clock(block, arrival)
         self._alarms.begin_block(pack_type, is_new_time_base=is_new_time_base)
         self._resume_after_store_change(pack_type, block)
         # another pack may have used the window meanwhile
@@ -278,15 +278,18 @@ class BlockProcessor:
         return gap_s if gap_s >= 0.0 else math.inf
 
     def _roll_over_hour(
-        self, pack: str, block: Block, arrival: Arrival, pack_type: PackType
+        self, pack: str, block: Block, arrival: Arrival, pack_type: PackType, *, is_new_time_base: bool
     ) -> tuple[tuple[tuple[str, bytes], ...], bool]:
         """If the block is of a later hour, finish the current hour and begin the new one.
+
+        Also begin an earlier hour if the block is the first of a new store, whose clock may be days behind. Otherwise the pack
+        would have no row until this clock has reached the current hour.
 
         Returns:
             Message id and row of the finished hour, empty for the first hour of a pack; and True if a new hour has begun.
         """
         hour, current = hour_summary.hour_of(block), int(self._delivery["hour"])
-        if hour <= current:
+        if hour == current or (hour < current and not is_new_time_base):
             return (), False
         rows: tuple[tuple[str, bytes], ...] = ()
         if current:

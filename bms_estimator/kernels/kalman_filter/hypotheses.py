@@ -404,7 +404,7 @@ def reinitialize_if_biased(s: Record, p: Record) -> None:
 @njit(cache=True)
 def detect_exchange(s: Record) -> None:
     """Detect that the pack was exchanged in the last gap, because no possible current in the gap explains the SOC after it."""
-    error = EXCHANGE_STDS * math.hypot(s.soc_std, s.std_before)
+    error = EXCHANGE_STDS * math.sqrt(s.soc_std**2 + s.std_before**2)
     if s.gap_s > 0.0 and abs(s.soc - s.soc_before) > error + MAX_EVENT_C * s.gap_s / 3600.0:
         s.exchanged = 1
 
@@ -425,4 +425,4 @@ def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
 def weakest_cell_soc_std(s: Record, p: Record) -> float:
     """Return the std of the SOC of the weakest cell in series, whose deviation from the mean cannot be observed."""
     spread = p.cell_spread * (1.0 - s.soc) if p.series > 1.0 else 0.0
-    return math.hypot(max(s.soc_std, p.min_soc_std), spread)
+    return math.sqrt(max(s.soc_std, p.min_soc_std) ** 2 + spread**2)

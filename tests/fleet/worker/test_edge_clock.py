@@ -1,27 +1,75 @@
 """Edges with a wrong clock, judged by the server's time at the arrival of their blocks."""
 
+import asyncio
+import signal
+import sys
 import time
 
 import numpy as np
 import pytest
 
 from bms_estimator.edge import subjects
-from bms_estimator.edge.block import Block, encode
+from bms_estimator.edge.block import Block, decode, encode
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.nats.streams import make_streams
+from bms_estimator.fleet.queries.duckdb_queries import run_query
+from bms_estimator.fleet.queries.parquet_files import write
 from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S, MAX_BEHIND_S
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.pinned_consumer import parse_position
 from bms_estimator.model.sample import SAMPLE
+from bms_estimator.process.tasks import end
+from tests.command_line import running_program
+from tests.edge.test_edge_process import Board, write_pack_file
 from tests.fleet.nats_cluster import connected, running
 from tests.fleet.partition_stream import STORE_ID_NS, one_block, table
 from tests.fleet.workers import Heartbeats, Process, load_packs, send
+from tests.patience import LONG_S
 
 STORE_S = STORE_ID_NS // 10**9
 """Creation time of the edge's store [s since 1970]."""
 YEAR_2040_S = 2_208_988_800
 """Beginning of the year 2040 [s since 1970]."""
+DAY_S = 86_400
+RUN_WITH_CLOCK = """
+import sys, time
+from pathlib import Path
+offset_file, wall = Path(sys.argv.pop(1)), time.time
+time.time = lambda: wall() + float(offset_file.read_text())
+from bms_estimator.cli.main import main
+main()
+"""
+"""Program that runs the command line with a wall clock whose error [s] is in a file."""
+
+
+class EdgeWithClock:
+    """Process ``edge`` whose wall clock has an error."""
+
+    def __init__(self, folder, settings):
+        self._error_file = folder / "clock-error"
+        self._command = [sys.executable, "-c", RUN_WITH_CLOCK, self._error_file, "edge", settings]
+
+    async def run(self, heartbeats, *errors_s):
+        """Run the edge, with each error [s] until a worker has two more blocks; then shut it down."""
+        self._set(errors_s[0])
+        async with running_program(*self._command, stdout=asyncio.subprocess.DEVNULL, stderr=None) as process:
+            for error_s in errors_s:
+                self._set(error_s)
+                enough = processed(heartbeats.last) + 2
+                await heartbeats.until(lambda last, enough=enough: processed(last) >= enough)
+            process.send_signal(signal.SIGTERM)
+            assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+
+    def _set(self, error_s):
+        new = self._error_file.with_suffix(".new")
+        new.write_text(str(error_s))
+        new.replace(self._error_file)
+
+
+def processed(last):
+    """Return the number of blocks in the worker's last heartbeat."""
+    return last["w1"].counters.get("blocks", 0) if "w1" in last else 0
 
 
 def samples_until(last_s):
@@ -85,6 +133,27 @@ def test_hour_with_one_block_from_the_future_is_quarantined_and_the_following_ho
         rows += [Hour.model_validate_json(data) for _, data in result.hours]
     assert [row.clock_error_s for row in rows] == [7200.0, None]
     assert partition.clock_errors == {}
+
+
+def test_new_store_of_an_edge_whose_clock_steps_back_by_days_has_its_own_hours():
+    partition = Partition(0, table)
+    days_later_s, behind_s = 3 * 86_400, 2 * 86_400
+    stores_s = {"old": STORE_S, "new": STORE_S + days_later_s - behind_s}
+    blocks = [
+        ("old", 1, 3000.0),
+        ("old", 2, days_later_s - 3700.0),
+        ("new", 1, 100.0),
+        ("new", 2, 1000.0),
+        ("new", 3, 4000.0),
+    ]
+    rows = []
+    for sequence, (store, number, last_s) in enumerate(blocks, 1):
+        received_s = round(stores_s[store] + last_s + (behind_s if store == "new" else 0))
+        block = one_block(samples_until(last_s), number, stores_s[store] * 10**9)
+        rows += [Hour.model_validate_json(data) for _, data in partition.take("a", block, sequence, received_s).hours]
+    first, last, behind = (int(STORE_S + s) // 3600 for s in (3000.0, days_later_s - 3700.0, days_later_s - behind_s))
+    assert [(row.hour, row.samples) for row in rows] == [(first, 60), (last, 60), (behind, 120)]
+    assert (partition.clock_errors, partition.counters.get("former_store", 0)) == ({}, 0)
 
 
 def test_clock_error_of_an_unfinished_hour_survives_a_takeover():
@@ -160,3 +229,47 @@ async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_
         assert [row.revision for row in rows["p1"]] == [3, 5]
         assert all(abs(row.received_hour - time.time() / 3600) < 2 for row in rows["p1"] + rows["p2"])
         await nc.close()
+
+
+@pytest.mark.thorough
+async def test_edge_whose_clock_steps_back_by_days_loses_no_sample_and_is_not_silent(tmp_path, line):
+    """The clock is 5 days behind, then correct, then 3 days behind, also after restarts: with the store and without it."""
+    line.plug()
+    with running(tmp_path, partitions=1) as cluster:
+        board = asyncio.create_task(Board(line).print_lines())
+        nc = await connected(cluster.urls)
+        await make_streams(nc, partitions=1)
+        await load_packs(nc, ["pack"])
+        worker = Process(tmp_path, cluster.url, "w1")
+        edge = EdgeWithClock(tmp_path, write_pack_file(tmp_path, line, cluster.mqtt_port))
+        try:
+            async with Heartbeats(nc) as heartbeats:
+                await edge.run(heartbeats, -5 * DAY_S, 0, -3 * DAY_S)
+                await edge.run(heartbeats, -3 * DAY_S)
+                for file in (tmp_path / "state-home").rglob("pack.edge.sqlite*"):
+                    file.unlink()
+                await edge.run(heartbeats, -3 * DAY_S)
+                stored = [each async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
+                decoded = [decode(each.data) for each in stored]
+                blocks = {(block.store_created_ns, block.number): block for block in decoded}  # some were sent again
+                await heartbeats.until(lambda last: last["w1"].counters["blocks"] == len(blocks))
+            heartbeat = heartbeats.last["w1"]
+            assert await worker.end() == 0
+        finally:
+            worker.kill()
+            await end(board)
+        stored = [each async for batch in read_stream(nc, subjects.HOURS_STREAM, ">") for each in batch]
+        rows = [Hour.model_validate_json(each.data) for each in stored]
+        await nc.close()
+    first_store, last_store = sorted({store for store, _ in blocks})
+    assert (last_store - first_store) / 1e9 == pytest.approx(2 * DAY_S, abs=2 * LONG_S)
+    lines = np.concatenate([np.round((block.samples["voltage_v"] - 3.0) * 1e4) for _, block in sorted(blocks.items())])
+    assert heartbeat.counters["samples"] == lines.size
+    assert np.count_nonzero(np.diff(lines) != 1.0) == 2  # the restarts
+    assert (heartbeat.clock_errors, heartbeat.counters["lost_blocks"]) == ({}, 0)
+    assert min(row.received_hour - row.hour for row in rows) in (
+        0,
+        1,
+    )  # 120 only, if the earlier hour of the new store is ignored
+    write(tmp_path / "rows", rows)
+    assert run_query(tmp_path / "rows", "silent").rows == []
