@@ -15,7 +15,7 @@ from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, add_reference, complete_row
 from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR, apply_prior
 from bms_estimator.kernels.kalman_filter.hypotheses import USER_SOC_STD, set_soc, weakest_cell_soc_std
-from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
+from bms_estimator.kernels.kalman_filter.input_checks import FITTED_FAULTS, UNUSABLE, store_last_good_state
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.kernels.step import SampleOutcome
@@ -213,7 +213,9 @@ class Estimator:
             self.state["soc"] = f["soc"]
         if state.is_exchanged:
             f["exchanged"] = 1  # raises the input diagnostic of an exchange
-        store_last_good_state(self.record[0]["checks"], f)
+        checks = self.record[0]["checks"]
+        checks["suspects"] = checks["suspects"] & ~FITTED_FAULTS | state.faults
+        store_last_good_state(checks, f)
 
     def load_exact(self, record: NDArray[np.void], settings_record: NDArray[np.void]) -> None:
         """Return to copies of ``record`` and ``settings_record``, to the last bit."""

@@ -8,6 +8,7 @@ from bms_estimator.kernels.kalman_filter.ekf import MAX_SOC, MIN_SOC
 from bms_estimator.kernels.kalman_filter.mixture import clear_hypothesis, copy_hypothesis, mixture_moments
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC
 from bms_estimator.model.arrays import Floats
+from bms_estimator.model.input_faults import InputFault
 
 FILTER_STATES = np.array([SOC, LN_Q, OFFSET, *range(NODE, NODE + NODES)])
 """States of the filter that a fit determines jointly."""
@@ -25,6 +26,7 @@ class FittedState:
         offset_a: Current offset [A].
         covariance: Covariance of ``FILTER_STATES``. The correction of the OCV is 0, because the settings have the fitted curves.
         is_exchanged: True if the voltages show another pack.
+        faults: Faults that the fitted values show.
     """
 
     soc: float | None
@@ -32,6 +34,7 @@ class FittedState:
     offset_a: float
     covariance: Floats
     is_exchanged: bool
+    faults: InputFault
 
 
 def write_fitted_state(f: np.void, p: np.void, state: FittedState) -> None:

@@ -16,6 +16,9 @@ class InputFault(IntFlag):
     CURRENT = 128
     PACK = 256
     LEVEL = 512
+    FITTED_CURVE = 1024
+    FITTED_RESISTANCE = 2048
+    FITTED_TEMPERATURE = 4096
 
     @property
     def text(self) -> str:
@@ -45,4 +48,10 @@ _TEXTS = {
     "(bms-estimator ocv)",
     InputFault.PACK: "SOC or voltages after a gap do not fit the pack before it: check whether the pack "
     "was exchanged, because capacity and resistances were learned from the pack before; the request forget_pack discards them",
+    InputFault.FITTED_CURVE: "fitted OCV or hysteresis lie far from those of the cell file: check the chemistry of the cell "
+    "and the voltage of the terminals with a multimeter, or make a cell file with the curve of this cell (bms-estimator ocv)",
+    InputFault.FITTED_RESISTANCE: "fitted resistances lie far from those of the cell file: check contacts, the place of the voltage taps, "
+    "the number of cells in parallel, and that voltage and current are taken at the same time",
+    InputFault.FITTED_TEMPERATURE: "the fitted change of OCV or resistances with temperature lies far from that of the cell file: check "
+    "that the temperature sensor touches the cells, or make a cell file with captures at several temperatures",
 }

@@ -138,17 +138,6 @@ class Accuracy:
         return float(self.std(self.soc).mean())
 
 
-def bound(cell: CellCurves, window: tuple[float, float], *, full: bool) -> float:
-    """Return the lower bound of the std of the SOC after infinite time, mean over a window.
-
-    Args:
-        cell: Curves and prior of the cell.
-        window: Lowest and highest SOC that the pack passes.
-        full: True: the ends of charges are seen.
-    """
-    return Accuracy(cell, Window(*window, full=full)).mean_std
-
-
 def improvements(cell: CellCurves, window: Window) -> dict[str, float]:
     """Return the lower bound of the std in the present window after each possible change, the lowest first.
 

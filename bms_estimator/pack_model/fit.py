@@ -7,7 +7,7 @@ pack after the gap, no common fit explains the rows of both packs, and the RMS r
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.kalman_filter.records import NODES
 from bms_estimator.kernels.pack_voltage import CURVE_NODES, SHAPE_NODES
 from bms_estimator.model.arrays import Floats
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition
 from bms_estimator.pack_model.equations import Equations, Residuals
 from bms_estimator.pack_model.prediction import Reference
@@ -104,6 +105,8 @@ class PackFit:
     """Number of the first fitted segment. Earlier segments were measured on another pack."""
     is_exchanged: bool = False
     """True: the pack was exchanged in the gap before the last segment, so that only this segment is fitted."""
+    faults: InputFault = field(default=InputFault(0))
+    """Faults that the fitted values show."""
 
 
 FINITE_FIELDS = tuple(
@@ -284,6 +287,7 @@ def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
         cost=minima[0].cost,
         curves=tuple(m.x[u.curve.start :] for m in minima),
         first_segment=float(rows["segment"][0]),
+        faults=equations.prior.faults(u, x),
     )
 
 

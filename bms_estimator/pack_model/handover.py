@@ -116,6 +116,7 @@ def adopt_state(estimator: Estimator, fit: PackFit) -> None:
             offset_a=fit.mean[FIT_OFFSET] * p["capacity_as"] / HOUR_S,
             covariance=_state_covariance(fit, p),
             is_exchanged=fit.is_exchanged,
+            faults=fit.faults,
         )
     )
 

@@ -14,6 +14,7 @@ from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
 from bms_estimator.kernels.kalman_filter.ocv_correction import CORRELATION_SOC
 from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES, SHAPE_NODES
 from bms_estimator.model.arrays import Floats
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.pack_model.aging import CAPACITY, RESISTANCE, AgingVariance
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.intervals import Intervals
@@ -61,6 +62,8 @@ MIN_OFFSET_STD_C, ROUNDING_FRACTION = 1e-6, 1e-6
 precision finite."""
 NEW_SEGMENT_SOC, NEW_SEGMENT_STD = 0.5, 1.0
 """Mean and std of the SOC at the start of a segment. The gap before it may hide any charge."""
+FAULT_STDS = 4.0
+"""Distance of an unknown from the mean of its prior above which the input or the cell file counts as wrong [std]."""
 
 
 class Prior:
@@ -85,6 +88,19 @@ class Prior:
         self._add_soc(intervals, u)
         self._add_offset(cell, intervals, u)
         self._add_capacity(cell, intervals, u)
+
+    def faults(self, u: Unknowns, x: Floats) -> InputFault:
+        """Return the faults that unknowns beyond ``FAULT_STDS`` show. Unknowns of different kinds are independent in the prior."""
+
+        def is_far(part: slice) -> bool:
+            variance = np.diag(np.linalg.inv(self.precision[part, part]))
+            return bool(((x[part] - self.mean[part]) ** 2 > FAULT_STDS**2 * variance).any())
+
+        return InputFault(
+            InputFault.FITTED_CURVE * any(map(is_far, (u.curve, u.direction, u.hysteresis)))
+            + InputFault.FITTED_RESISTANCE * any(map(is_far, (u.ln_r, u.aging, u.shape)))
+            + InputFault.FITTED_TEMPERATURE * any(map(is_far, (u.entropy, u.arrhenius)))
+        )
 
     def _add_square(self, at: list[int], factors: list[float], std: float) -> None:
         """Add a squared residual to the cost: sum of factors times deviations from the mean, divided by ``std``."""

@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.pack_model.accuracy import Accuracy, Window, bound, improvements
+from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.prior import DIRECTION_CORRELATION_SOC, curve_covariance
 from bms_estimator.pack_model.unknowns import DIRECTIONS
@@ -66,7 +66,7 @@ def test_a_full_charge_lowers_the_std_and_a_narrow_window_raises_it(name: str) -
     assert stds == sorted(stds)
     assert stds[0] < stds[-1]
     for low in LOWEST_SOCS:
-        assert bound(cell, (low, 1.0), full=True) < 0.9 * bound(cell, (low, Window.high), full=False)
+        assert Accuracy(cell, Window(low, full=True)).mean_std < 0.9 * Accuracy(cell, Window(low)).mean_std
 
 
 def test_an_unseen_charge_raises_the_std_and_a_measured_capacity_lowers_it() -> None:

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import LN_Q, LN_R, OFFSET, SOC, STARTS, FitError, PackFit, fit, starts
 from tests.pack_model.histories import (
@@ -55,6 +57,26 @@ def test_rows_without_noise_are_fitted_back(truth: Truth) -> None:
     assert std[LN_Q] < 0.5 * cell.capacity_std
     assert abs(fitted.mean[OFFSET] - truth.offset_c) < 0.5 * std[OFFSET]
     np.testing.assert_allclose(fitted.mean[LN_R], truth.ln_r, atol=0.08)
+    assert not fitted.faults
+
+
+@pytest.mark.parametrize(
+    ("chemistry", "columns", "middle", "ratio", "fault"),
+    [
+        ("nmc", ["current_a", "x_a"], 0.0, 0.05, InputFault.FITTED_RESISTANCE),
+        ("nmc", ["temperature_c"], REFERENCE_C, -0.6, InputFault.FITTED_TEMPERATURE),
+        ("lfp", ["voltage_v"], 0.0, 1.03, InputFault.FITTED_CURVE),
+    ],
+)
+def test_a_fitted_value_far_from_its_prior_is_a_fault(
+    chemistry: str, columns: list[str], middle: float, ratio: float, fault: InputFault
+) -> None:
+    """The measured values have a wrong gain about ``middle``."""
+    cell = cell_curves(chemistry)
+    rows = with_voltages(cell, measured_rows(cell), Truth())
+    for name in columns:
+        rows[name] = middle + (rows[name] - middle) * ratio
+    assert fit(cell, rows).faults == fault
 
 
 def end_soc(cell: CellCurves, rows: np.ndarray, truth: Truth) -> float:

@@ -10,14 +10,13 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.estimator.fitted_state import FILTER_STATES
-from bms_estimator.kernels.cell_model.rc_ladder import GRID
-from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC, STATES
+from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC
 from bms_estimator.model.cell import load_cell
+from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import slow_fit as slow_fit_module
-from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.pack_model.fit import FitError, PackFit
 from bms_estimator.pack_model.slow_fit import SlowFit, run_now
 from bms_estimator.settings.sampling import Sampling
@@ -138,6 +137,19 @@ def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pyt
     assert np.linalg.eigvalsh(block).min() > -1e-9 * np.linalg.eigvalsh(block).max()
 
 
+def test_a_fault_that_a_fit_shows_remains_until_a_fit_without_it(
+    samples: SampleBlock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults = iter([InputFault.FITTED_TEMPERATURE, *[InputFault(0)] * 8])
+    monkeypatch.setattr(slow_fit_module, "fit", lambda *args: replace(quick_fit(*args), faults=next(faults)))
+    slow_fit = new_slow_fit()
+    for block in np.array_split(samples, 8):  # half hours
+        run(slow_fit, block)
+        suspects = InputFault(int(slow_fit.estimator.record[0]["checks"]["suspects"]))
+        assert (InputFault.FITTED_TEMPERATURE in suspects) == (slow_fit.fits == 1)
+    assert slow_fit.fits > 1
+
+
 def test_hypotheses_keep_their_soc_if_a_gap_followed_the_fit(samples: SampleBlock) -> None:
     """The gap may hide a charge, so that the fit has no information on the present SOC."""
     slow_fit = new_slow_fit()
@@ -158,20 +170,24 @@ def test_hypotheses_keep_their_soc_if_a_gap_followed_the_fit(samples: SampleBloc
     assert np.all(f["mean"][:count, LN_Q] == fitted.mean[fit_module.LN_Q])
 
 
-@pytest.mark.parametrize(("soc_std", "first_s"), [(0.05, 1800.0), (0.07, 5400.0)])
-def test_a_fit_of_less_than_a_cycle_is_adopted_only_if_its_std_is_small(
-    samples: SampleBlock, monkeypatch: pytest.MonkeyPatch, soc_std: float, first_s: float
-) -> None:
-    """The throughput exceeds 1 in the third half hour."""
+def quick_fit_with(std: Callable[[], float]) -> Callable[..., PackFit]:
+    """Return a fit with a std of the SOC."""
 
     def fit_with_std(*args: object) -> PackFit:
         fitted = quick_fit(*args)  # type: ignore[arg-type]
-        fitted.covariance[fit_module.SOC, fit_module.SOC] = soc_std**2
+        fitted.covariance[fit_module.SOC, fit_module.SOC] = std() ** 2
         return fitted
 
-    monkeypatch.setattr(slow_fit_module, "fit", fit_with_std)
+    return fit_with_std
+
+
+@pytest.mark.parametrize(("soc_std", "begin"), [(0.05, 1800), (0.07, 5400)])
+def test_a_fit_of_less_than_a_cycle_is_adopted_only_if_its_std_is_small(
+    samples: SampleBlock, monkeypatch: pytest.MonkeyPatch, soc_std: float, begin: int
+) -> None:
+    """The throughput exceeds 1 in the third half hour."""
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit_with(lambda: soc_std))
     slow_fit = new_slow_fit()
-    begin = int(first_s)
     run(slow_fit, samples[:begin])
     assert slow_fit.fits == 0
     run(slow_fit, samples[begin : begin + 300])
@@ -183,17 +199,9 @@ def test_a_fit_after_few_rows_and_restarts_does_not_enlarge_the_std(
     samples: SampleBlock, monkeypatch: pytest.MonkeyPatch, ratio: float, is_adopted: bool
 ) -> None:
     """Six starts in half an hour leave a few rows in several segments, which do not determine the SOC."""
-
-    def fit_with_std(*args: object) -> PackFit:
-        fitted = quick_fit(*args)  # type: ignore[arg-type]
-        fitted.covariance[fit_module.SOC, fit_module.SOC] = (ratio * filter_std()) ** 2
-        return fitted
-
-    def filter_std() -> float:
-        return float(slow_fit.estimator.record[0]["filter"]["soc_std"])
-
-    monkeypatch.setattr(slow_fit_module, "fit", fit_with_std)
     slow_fit = new_slow_fit()
+    f = slow_fit.estimator.record[0]["filter"]
+    monkeypatch.setattr(slow_fit_module, "fit", quick_fit_with(lambda: ratio * float(f["soc_std"])))
     for start in range(6):
         part = samples[300 * start : 300 * (start + 1)]
         run(slow_fit, part)
@@ -208,6 +216,21 @@ def test_a_fit_after_few_rows_and_restarts_does_not_enlarge_the_std(
     assert slow_fit.saved_fit is not None
 
 
+def histories_of_fits(samples: SampleBlock) -> np.ndarray:
+    """Return number of rows and age [s] of the history at the start of each fit in a day."""
+    histories: list[tuple[int, float]] = []
+
+    def submit(call: Callable[[], PackFit]) -> Future[PackFit]:
+        histories.append((slow_fit.history.rows.size, float(slow_fit.estimator.record[0]["history"]["elapsed_s"])))
+        return run_now(call)
+
+    slow_fit = SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah)), submit=submit, interval_s=3600.0)
+    day = np.tile(samples, 6)
+    day["time_s"] = np.arange(day.size)
+    run(slow_fit, day)
+    return np.array(histories).T
+
+
 @pytest.mark.parametrize(("max_certain_std", "waits"), [(0.04, True), (0.02, False)])
 def test_a_fit_after_a_certain_one_waits_until_the_history_has_grown(
     samples: SampleBlock, monkeypatch: pytest.MonkeyPatch, max_certain_std: float, waits: bool
@@ -216,40 +239,16 @@ def test_a_fit_after_a_certain_one_waits_until_the_history_has_grown(
     monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
     monkeypatch.setattr(slow_fit_module, "MIN_GROWTH", 0.3)
     monkeypatch.setattr(slow_fit_module, "MAX_CERTAIN_STD", max_certain_std)
-    sizes: list[int] = []
-
-    def submit(call: Callable[[], PackFit]) -> Future[PackFit]:
-        sizes.append(slow_fit.history.rows.size)
-        return run_now(call)
-
-    slow_fit = SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah)), submit=submit, interval_s=3600.0)
-    day = np.tile(samples, 6)
-    day["time_s"] = np.arange(day.size)
-    run(slow_fit, day)
-    assert len(sizes) > 3
-    assert (np.diff(sizes) >= 0.3 * np.array(sizes[1:])).all() == waits
+    sizes, _ = histories_of_fits(samples)
+    assert sizes.size > 3
+    assert (np.diff(sizes) >= 0.3 * sizes[1:]).all() == waits
 
 
 def test_a_short_history_is_fitted_more_often(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
-    times_s: list[float] = []
-
-    def submit(call: Callable[[], PackFit]) -> Future[PackFit]:
-        times_s.append(float(slow_fit.estimator.record[0]["history"]["elapsed_s"]))
-        return run_now(call)
-
-    slow_fit = SlowFit(Estimator(load_cell("nca", TRUTH.cell.capacity_ah)), submit=submit, interval_s=3600.0)
-    day = np.tile(samples, 6)
-    day["time_s"] = np.arange(day.size)
-    run(slow_fit, day)
+    _, times_s = histories_of_fits(samples)
     intervals_s = np.diff(times_s)
     assert intervals_s[0] == pytest.approx(1800.0, abs=15.0)
     assert intervals_s[-1] == pytest.approx(3600.0, abs=15.0)
     # the median, because a half hour with too few new rows has no fit
-    assert np.median(intervals_s[np.array(times_s[:-1]) < 6.0 * 3600.0]) == pytest.approx(1800.0, abs=15.0)
-
-
-def test_sizes_of_curves_and_states() -> None:
-    """Results of a fit are mapped by position to the grid of the settings and to the last states of the filter."""
-    assert SOC_GRID.size == GRID
-    assert STATES == NODE + NODES
+    assert np.median(intervals_s[times_s[:-1] < 6.0 * 3600.0]) == pytest.approx(1800.0, abs=15.0)

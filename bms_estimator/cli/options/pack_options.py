@@ -17,6 +17,9 @@ from bms_estimator.settings.sensor import SensorSettings
 
 LABORATORY_RESOLUTION_V = 1e-3
 """Voltage resolution of laboratory equipment [V], assumed for a capture without a pack file."""
+PLATEAU_CELL, PLATEAU_GAIN_STD = "lfp", 0.01
+"""Generic cell with a plateau, and std of the voltage's gain assumed for its captures. 0.5 % is 16 mV, the step between the two
+plateaus. On three parts of a capture 1.6 % above the curve, 0.01 gave an SOC error of 2.9 to 6.2 %, and 0.005 2.6 to 7.4 %."""
 
 
 def load_pack(path: Path) -> tuple[Settings, PackModel]:
@@ -65,7 +68,8 @@ def _unknown_sensor(cell: str) -> SensorSettings:
 
     A cell file may have been measured with the sensor of the capture. The gain relative to a generic cell is that of any sensor.
     """
-    gain_std = BMS_GAIN_STD if cell in generic_cells() else BOARD_GAIN_STD
+    generic_std = PLATEAU_GAIN_STD if cell == PLATEAU_CELL else BMS_GAIN_STD
+    gain_std = generic_std if cell in generic_cells() else BOARD_GAIN_STD
     return SensorSettings(voltage_resolution_v=LABORATORY_RESOLUTION_V, voltage_gain_std=gain_std)
 
 

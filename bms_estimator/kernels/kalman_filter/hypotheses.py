@@ -197,40 +197,35 @@ def begin_search(s: Record) -> None:
 
 @njit(cache=True)
 def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
-    """Initialize hypotheses after a gap: usual use in the gap, a rest, or any SOC.
+    """Initialize hypotheses after a gap: usual use in the gap or a rest, and any SOC.
 
     In the gap the pack may have been charged, discharged or exchanged, with a prior probability that grows with ``gap_s``
     [s]. Hypotheses with the same estimates of sensor and cell therefore cover SOC 0 to 1 evenly. One hypothesis remains
-    beside them: the usual load if its std is at most ``MAX_KEPT_STD``, or else a rest if it is likelier than one of the others.
-    If the voltage cannot distinguish them, the remaining one stays likely. The weights of the others contain the remaining
-    probability of the usual load.
+    beside them: the usual load if its std is at most ``MAX_KEPT_STD``, otherwise a rest. If the voltage cannot distinguish
+    them, the remaining one stays likely. The weights of the others contain the remaining probability of the usual load.
 
     Args:
         s: Record of EKF_STATE; hypothesis 0 was propagated with the usual load, and hypothesis 1 with a rest.
         p: Record of EKF_SETTINGS.
-        gap_s: Duration of the gap [s]; infinite if unknown.
+        gap_s: Duration of the gap [s]; infinite if unknown, with hypothesis 0 only.
         rested: True if the pack rested before the gap.
     """
     soc, std = s.mean[0, SOC], math.sqrt(s.covariance[0, SOC, SOC])
     event = p.event_probability * (1.0 - math.exp(-gap_s / p.event_s))
     kept, kept_probability = 0, 1.0 - event
     if std > MAX_KEPT_STD:
-        kept, kept_probability = 1, (1.0 - event) * rest_probability(soc, std, gap_s, rested)
-    if kept_probability < event / HYPOTHESES:
-        kept, kept_probability = -1, 0.0
-    even = HYPOTHESES if kept < 0 else HYPOTHESES - 1
+        kept = 0 if gap_s == math.inf else 1
+        kept_probability *= rest_probability(soc, std, gap_s, rested)
+    even = HYPOTHESES - 1
     spacing = 1.0 / (even - 1)
-    row = HYPOTHESES  # index of the remaining hypothesis, in the order of SOC; HYPOTHESES: none remains
-    if kept >= 0:
-        row = min(max(math.ceil(s.mean[kept, SOC] / spacing), 0), even)
-        if row != kept:
-            copy_hypothesis(s, kept, row)
-        for k in range(BRANCHES):
-            s.mean[row, X + k] += s.x_a[k]  # s.x_a becomes 0 below
+    row = min(max(math.ceil(s.mean[kept, SOC] / spacing), 0), even)  # of the remaining hypothesis, in the order of SOC
+    if row != kept:
+        copy_hypothesis(s, kept, row)
+    for k in range(BRANCHES):
+        s.mean[row, X + k] += s.x_a[k]  # s.x_a becomes 0 below
     # hypothesis ``first`` keeps the estimates of sensor and cell only, and is copied to the other evenly spaced ones
     first = 1 if row == 0 else 0
-    if row != HYPOTHESES:
-        copy_hypothesis(s, row, first)
+    copy_hypothesis(s, row, first)
     forget_state_of_charge(s, p, first)
     s.x_a[:] = 0.0
     for n in range(even - 1, -1, -1):
@@ -240,8 +235,7 @@ def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
         set_initial_soc(s, p, q, n * spacing, OVERLAP * spacing)
         weight = event / even + (1.0 - event - kept_probability) * spacing * normal_density(n * spacing, soc, std)
         s.ln_weight[q] = math.log(max(weight, MIN_PROBABILITY))
-    if kept >= 0:
-        s.ln_weight[row] = math.log(max(kept_probability, MIN_PROBABILITY))
+    s.ln_weight[row] = math.log(max(kept_probability, MIN_PROBABILITY))
     s.count, s.best = HYPOTHESES, np.argmax(s.ln_weight)
     begin_search(s)
 

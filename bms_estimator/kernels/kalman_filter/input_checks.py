@@ -80,9 +80,11 @@ MAX_REINITIALIZATIONS = 4.0
 TEMPERATURE_MARGIN_K = 5.0
 """Distance from the temperature range of the cell file for the fault TEMPERATURE [K]."""
 
-SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT, PACK, LEVEL = (
+SIGN_OF_CURRENT, OFFSET_BIT, CAPACITY, OCV, OUTLIERS, TEMPERATURE, VOLTAGE, CURRENT, PACK, LEVEL, *_FITTED = (
     int(bit) for bit in InputFault
 )
+FITTED_FAULTS = sum(_FITTED)
+"""Faults that a fit of the pack's model shows. They remain until the next fit, or until a fault of ``UNUSABLE``."""
 UNUSABLE = SIGN_OF_CURRENT | VOLTAGE | CURRENT
 """Faults during which the voltage is not used."""
 
@@ -346,7 +348,7 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
         bits |= TEMPERATURE
     if f.exchanged:
         bits |= PACK
-    c.suspects = bits | plateau_level_bit(f, p, before)
+    c.suspects = bits | plateau_level_bit(f, p, before) | before & FITTED_FAULTS
 
 
 @njit(cache=True)

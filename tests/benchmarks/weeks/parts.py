@@ -158,9 +158,7 @@ PARTS: dict[str, Part] = {
     "std of the surface SOC under load": Part(((prediction, "SURFACE_STD_SOC", 0.0),)),
     "smaller weight of SOC zones without a fit": Part(((equations, "FITTED_RMS", 1.0 / ZERO),)),
     "Huber": Part(((equations, "HUBER", 1.0 / ZERO),)),
-    "larger error at the knee near empty": Part(
-        ((prediction, "KNEE_STD_SOC", 0.0), (prediction, "EMPTY_RELATIVE", 0.0))
-    ),
+    "larger error at the knee near empty": Part(((prediction, "KNEE_STD_SOC", 0.0),)),
     "end of an interval by the std of its charge": Part(((intervals, "COUNTED_STD", np.inf),)),
     "links across gaps": Part(((Links, "of", links_without_gaps),)),
     "charge hidden in a gap, in the slow fit": Part((set_in_curves(event_probability=0.0),)),

@@ -10,7 +10,7 @@ from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model.accuracy import bound
+from bms_estimator.pack_model.accuracy import Accuracy, Window
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.anywhere.score import Score, score
@@ -72,7 +72,7 @@ def bound_of(case: Case, cell: CellCurves, truth: np.ndarray) -> float:
     soc = truth["soc"]
     is_full = (soc > FULL_SOC) & (truth["current_a"] < 0.0)
     full = case.use not in UNSEEN_CHARGES and bool(is_full.any())
-    return bound(cell, (float(soc.min()), float(soc.max())), full=full)
+    return Accuracy(cell, Window(float(soc.min()), float(soc.max()), full=full)).mean_std
 
 
 def run_blocks(slow_fit: SlowFit, samples: SampleBlock) -> tuple[Floats, Floats, Floats]:
