@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LIMITS = {"bms_estimator": 46_790, "tests": 49_320}
+LIMITS = {"bms_estimator": 46_791, "tests": 49_320}
 
 
 def is_text(node: ast.stmt) -> bool:
