@@ -66,11 +66,9 @@ def with_pairs(devices: Sequence[FoundDevice]) -> list[FoundDevice]:
 
 def _may_be_of_one_pack(monitor: FoundDevice, bms: FoundDevice) -> bool:
     """Return True unless the voltages differ, or the devices publish to two brokers."""
-    if monitor.broker and bms.broker and monitor.broker != bms.broker:
-        return False
-    if monitor.voltage_v is None or bms.voltage_v is None:
-        return True
-    return math.isclose(monitor.voltage_v, bms.voltage_v, rel_tol=SAME_PACK)
+    is_one_broker = not (monitor.broker and bms.broker) or monitor.broker == bms.broker
+    voltage_v = monitor.voltage_v or bms.voltage_v or 0.0  # an unknown voltage may be that of the other device
+    return is_one_broker and math.isclose(voltage_v, bms.voltage_v or voltage_v, rel_tol=SAME_PACK)
 
 
 def _pair(monitor: FoundDevice, bms: FoundDevice) -> FoundDevice:

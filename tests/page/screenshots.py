@@ -184,7 +184,7 @@ async def shoot_states(folder: Path, browser: Browser) -> None:
 
 async def shoot_setup(folder: Path, browser: Browser) -> None:
     """Write screenshots of two steps of the setup page."""
-    bms = SimulatedBms("jk", lambda _: Reading(35.0, 52.8, 21.0), cells=16)
+    bms = SimulatedBms("jk", lambda _: Reading(35.0, 52.8, 21.0), cells=16, soc=lambda: 0.62, capacity_ah=CAPACITY_AH)
     page = PageSettings(listen="127.0.0.1:0")
     installed = patch("sys.executable", "/opt/bms-estimator/bin/python3")  # the page names the program beside it
     with running_device(bms) as path, contextlib.chdir(folder), installed:

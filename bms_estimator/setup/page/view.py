@@ -103,6 +103,7 @@ def _login(login: BrokerLogin, form_key: str) -> str:
 
 
 def _multimeter(session: SetupSession, form_key: str) -> str:
+    values, _, reported = str(session.measured).partition("; ")
     results = f"<ul>{_items(session.comparisons)}</ul>" if session.comparisons else ""
     voltage = _number_field("value", "Voltage at the terminals of the pack by the multimeter [V]")
     current = _number_field("value", "Current of a load by the multimeter [A], negative while the pack is charged")
@@ -111,7 +112,7 @@ def _multimeter(session: SetupSession, form_key: str) -> str:
         f"<option>{DISCHARGING}</option><option>{CHARGING}</option></select></label>"
     )
     return (
-        f'<section class="card"><h2>Measured by the device</h2><p class="big">{escape(str(session.measured))}</p>'
+        f'<section class="card"><h2>Measured by the device</h2><p class="big">{escape(values)}</p><p>{escape(reported)}</p>'
         f"{results}{_form('continue', form_key, '', 'Continue')}</section>"
         '<section class="card"><h2>Compare with a multimeter</h2><p class="note">Each comparison may be left out. '
         "A second voltage at another state of charge makes the gain more exact.</p>"
