@@ -9,30 +9,22 @@ import structlog
 
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.settings.alarm_kinds import Quantity
-from bms_estimator.settings.alarm_limits import min_charge_current_a, monitored_alarms, silent_limit_s
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.inputs import Inputs
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.sample_intervals import UNUSABLE_KINDS, SampleCounts
 from bms_estimator.telemetry.alarms.sensor_faults import BoardResets
 from bms_estimator.telemetry.cells import cell_faults
-from bms_estimator.telemetry.health import sample_counters, suspicions
-from bms_estimator.telemetry.impossible import PackBounds
 
 if TYPE_CHECKING:
     from bms_estimator.estimator.cell_estimator import CellDeviations
 
 EVALUATION_S = 0.1
-"""Interval between two evaluations [s]. An evaluation of each block would take as long as the estimate."""
-EVALUATION_ROWS = 1024
-"""Number of samples after which the alarms are evaluated before ``EVALUATION_S`` has elapsed."""
+"""Minimum interval between two reports of changes, and between two evaluations of silence, resets and hooks [s]."""
 
 log = structlog.get_logger(__name__)
 
@@ -67,30 +59,20 @@ class AlarmMonitor:
         on_alarm: Callable[[Change], object],
         hooks: Callable[[], HookHealth | None] = lambda: None,
     ) -> None:
-        self._pack, self._hooks, cell = pack, hooks, pack.model
+        self._pack, self._hooks = pack, hooks
         self._cells_seen: CellDeviations | None = None  # evaluated last
         self._board_resets = BoardResets()
         self._relay_resets = 0  # number of resets that undid a relay level, at the last evaluation
         self._estimator, self._source, self._clock, self._on_alarm = pack.estimator, source, clock, on_alarm
-        gap_s = float(pack.estimator.settings["gap_s"][0])
-        inputs = Inputs(settings.alarms.lost_s, cell.cell.series_count)
-        self.alarms = AlarmEvaluator(
-            monitored_alarms(settings, cell),
-            min_charge_current_a(cell),
-            gap_s,
-            inputs,
-            silent_limit_s(settings),
-            PackBounds.of(cell),
-        )
+        self.alarms = AlarmEvaluator(settings, pack.estimator)
         self.report = self.alarms.report()
         self.changed = asyncio.Event()
-        # arrival of the last sample, accepted or not, on the monotonic clock and on the wall clock [s]
-        self._last_sample_s, self._arrival_s = clock.monotonic(), clock.wall()
+        self._last_sample_s = clock.monotonic()  # arrival of the last sample, accepted or not
         self._evaluated_s = -math.inf
         self._is_stopped = False
 
     def add(self, received: ReceivedSamples, step: Step, now_s: float, cells_fault: str = "") -> bool:
-        """Add received samples and their estimates; evaluate the alarms if this is due.
+        """Evaluate the alarms on received samples and their estimates; report changes if this is due.
 
         Args:
             received: Samples and cell voltages.
@@ -99,36 +81,39 @@ class AlarmMonitor:
             cells_fault: Reason why the cell voltages cannot be used; empty if they can.
 
         Returns:
-            True if an alarm has changed.
+            True if a change was reported.
         """
-        self.alarms.add(received.samples, step.trace, received.cells_v, step.forecasts, cells_fault, received.probes)
-        self._last_sample_s, self._arrival_s = now_s, self._clock.wall()
-        is_due = now_s - self._evaluated_s >= EVALUATION_S or self.alarms.rows >= EVALUATION_ROWS
-        return is_due and self.evaluate(now_s)
+        if not self._is_stopped:
+            cells, slow_fit = self._pack.cells.deviations if self._pack.cells else None, self._pack.slow_fit
+            is_new, self._cells_seen = cells is not self._cells_seen, cells
+            self.alarms.evaluate(
+                received.samples,
+                step.trace,
+                received.cells_v,
+                self._clock.wall(),
+                forecasts=step.forecasts,
+                probes=received.probes,
+                cells_fault=cells_fault,
+                clock_fault=self._source.clock_fault,
+                lost=self._lost,
+                cell_faults=cell_faults(cells) if cells is not None and is_new else None,
+                weak_cell_std=slow_fit.weak_cell_std if slow_fit else math.nan,
+            )
+        self._last_sample_s = now_s
+        return now_s - self._evaluated_s >= EVALUATION_S and self.evaluate(now_s)
 
     def evaluate(self, now_s: float) -> bool:
-        """Evaluate the alarms from the samples since the last call, or from their absence; no effect after ``stop``.
+        """Evaluate silence, resets of the board and hooks, and report all changes; no effect after ``stop``.
 
         Args:
             now_s: Monotonic clock [s].
 
         Returns:
-            True if an alarm has changed.
+            True if a change was reported.
         """
         if self._is_stopped:
             return False
         elapsed_s, self._evaluated_s = now_s - self._evaluated_s, now_s
-        record = self._estimator.record[0]
-        suspects = InputFault(int(record["checks"]["suspects"]))
-        texts = suspicions(record, self._estimator.settings_record[0]) if suspects else ()
-        self.alarms.evaluate(self._arrival_s, self._counts(), suspects, texts, self._source.clock_fault)
-        self.alarms.evaluate_weak_cell(
-            self._pack.slow_fit.weak_cell_std if self._pack.slow_fit else math.nan, self._arrival_s
-        )
-        cells = self._pack.cells.deviations if self._pack.cells else None
-        if cells is not None and cells is not self._cells_seen:
-            self._cells_seen = cells
-            self.alarms.evaluate_cells(cell_faults(cells), self._arrival_s)
         self._evaluate_silence(now_s)
         resets = self._source.counters.get("resets", 0)
         self.alarms.evaluate_resets(self._board_resets.update(resets, now_s), self._clock.wall())
@@ -207,14 +192,14 @@ class AlarmMonitor:
             measured["cells"] = self._pack.cells.cells.size - 1  # one may never have been measured
         return measured
 
-    def _counts(self) -> SampleCounts:
-        """Return the sample counters.
+    @property
+    def _lost(self) -> int:
+        """Number of samples that were lost on the line.
 
         The larger one of lost frames and errors counts, because a damaged frame is also missing in the sequence of frames.
         """
-        line, samples = self._source.counters, sample_counters(self._estimator.state[0])
-        lost = max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
-        return SampleCounts(samples["samples"], lost + sum(samples[f"dropped_{kind}"] for kind in UNUSABLE_KINDS))
+        line = self._source.counters
+        return max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
 
     def _report_changes(self) -> bool:
         """Update the report, log all new changes and pass them to the callback. Return True if there are any."""

@@ -12,7 +12,7 @@ from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import fit
@@ -22,6 +22,7 @@ from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.service.kernel_compilation import compile_kernels
 from bms_estimator.settings.alarm_limits import MIN_CELLS
 from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import Window
@@ -31,6 +32,8 @@ CELL = "chen_mora"
 """Cell file of the warm-up. Any file would do, because the kernels do not depend on the cell."""
 WARM_UP_S = 330
 """Duration of the load with which the kernels of a forecast are called [s], longer than ``forecaster.MIN_LOAD_S``."""
+SILENT_S = 1e6
+"""Silence that raises the alarm ``link_lost`` [s]."""
 COLLECT_AFTER = 50_000
 """Number of new objects after which garbage is collected while kernels compile. numba creates many objects that stay."""
 
@@ -58,6 +61,11 @@ def _call_kernels() -> None:
     ChargeEnergyMeter(ChargeEnergy(), 1.0).add(trace)
     Window().add(trace, 0.0)
     known_rows(trace, False)
+    alarms = AlarmEvaluator(Settings(), estimator)
+    alarms.evaluate(sample, trace, NO_CELLS, arrival_s=0.0)
+    alarms.on_silence(SILENT_S, now_s=0.0, reason="", steady_s=0.0)
+    alarms.evaluate_hooks((), passed_s=0.0, now_s=0.0)
+    alarms.acknowledge(None)
     pack = cell.pack(MIN_CELLS, 1)
     CellEstimator(compiled_estimator(Settings(), pack)).run(sample, np.zeros((1, MIN_CELLS)), trace)
     estimator.add_prior(0.5, 0.1)

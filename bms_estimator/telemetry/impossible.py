@@ -1,22 +1,13 @@
-"""Measured values that cannot be true of a pack, whatever its state, and their likely cause."""
+"""Likely causes of measured values that cannot be true of a pack, whatever its state."""
 
 import math
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bms_estimator.kernels.alarms import (
-    MAX_SPREAD_V,
-    MAX_SUM_DIFFERENCE,
-    MEAN_HIGH_V,
-    MEAN_LOW_V,
-    MILLI,
-    MIN_MEAN_V,
-)
+from bms_estimator.kernels.alarms.values import MAX_SUM_DIFFERENCE, MEAN_HIGH_V, MEAN_LOW_V, MILLI
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.model.sample import MAX_CELL_V, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import Quantity
 
 FACTORS = 10, 100, 1000
@@ -30,17 +21,6 @@ STEPS = 1.0, 0.1, 0.01, 0.001
 """Usual resolutions of integers in protocols."""
 WORD_BITS = 16, 32
 """Lengths of integers in protocols."""
-
-
-class ImpossibleValue(NamedTuple):
-    """Samples with an impossible value of one quantity."""
-
-    rows: NDArray[np.bool_]
-    """True for each sample with an impossible value; shape (n,)."""
-    kind: str
-    """Likely cause of the last one, as part of a sentence."""
-    text: str
-    """The last one and its likely cause, as a sentence."""
 
 
 class PackBounds(NamedTuple):
@@ -60,43 +40,24 @@ class PackBounds(NamedTuple):
         c = cell.cell
         return cls(c.series_count, cell.possible_a, (c.voltage_min_v, c.voltage_max_v), c.current_max_a)
 
-    def find(self, samples: SampleBlock, cells: Floats) -> dict[Quantity, ImpossibleValue]:
-        """Return the impossible values by quantity.
+    def describe(self, quantity: Quantity, sample: np.void, cells_v: Floats) -> tuple[str, str]:
+        """Return the likely cause of an impossible value as part of a sentence, and a sentence with value and cause.
 
         Args:
-            samples: Shape (n,), dtype SAMPLE.
-            cells: Minimum, maximum [V], number and mean [V] of the cell voltages, shape (n, 4).
+            quantity: Quantity whose value is impossible (``kernels.alarms.values.possible_values``).
+            sample: The sample, dtype SAMPLE.
+            cells_v: Its cell voltages [V]; empty without any.
         """
-        voltage_v, current_a = samples["voltage_v"], samples["current_a"]
-        lowest_v, highest_v, count, mean_v = cells.T
-        pack_mean_v = voltage_v / self.series
-        # NaN is never outside a range and never differs
-        is_outside = (pack_mean_v < MIN_MEAN_V) | (pack_mean_v > MAX_CELL_V)
-        differs = (count == self.series) & (
-            np.abs(pack_mean_v - mean_v) > MAX_SUM_DIFFERENCE * np.maximum(np.abs(pack_mean_v), np.abs(mean_v))
-        )
-        pack_is_usual, cells_are_usual = ((v >= MEAN_LOW_V) & (v <= MEAN_HIGH_V) for v in (pack_mean_v, mean_v))
-        contradicts = differs & cells_are_usual
-        cells_agree = highest_v - lowest_v <= MAX_SPREAD_V
-        is_saturated = (samples["status"] & SampleStatus.CURRENT_SATURATED) != 0
-        found: dict[Quantity, ImpossibleValue] = {}
-        rows = is_outside | (contradicts & (~pack_is_usual | cells_agree))
-        if rows.any():
-            last = np.flatnonzero(rows)[-1]
-            sum_v = self.series * float(mean_v[last]) if contradicts[last] else math.nan
-            found["voltage"] = ImpossibleValue(rows, *self._describe_voltage(float(voltage_v[last]), sum_v))
-        rows = differs & pack_is_usual & ~cells_are_usual
-        if rows.any():
-            last = np.flatnonzero(rows)[-1]
-            found["cells"] = ImpossibleValue(
-                rows, *_describe_cells(self.series * float(mean_v[last]), float(voltage_v[last]))
-            )
-        low_v, high_v = self.range_v
-        is_milli = (voltage_v >= MILLI * low_v) & (voltage_v <= MILLI * high_v)  # then the current is, too
-        rows = (np.abs(current_a) > np.where(is_milli, self.range_a, self.max_a)) & ~is_saturated
-        if rows.any():
-            found["current"] = ImpossibleValue(rows, *self._describe_current(float(current_a[rows][-1])))
-        return found
+        if quantity == "current":
+            return self._describe_current(float(sample["current_a"]))
+        voltage_v, finite_v = float(sample["voltage_v"]), cells_v[np.isfinite(cells_v)]
+        with np.errstate(over="ignore"):
+            sum_v = float(finite_v.sum()) if finite_v.size == self.series else math.nan
+        if quantity == "cells":
+            return _describe_cells(sum_v, voltage_v)
+        is_usual = MEAN_LOW_V <= sum_v / self.series <= MEAN_HIGH_V
+        differs = abs(voltage_v - sum_v) > MAX_SUM_DIFFERENCE * max(abs(voltage_v), abs(sum_v))
+        return self._describe_voltage(voltage_v, sum_v if is_usual and differs else math.nan)
 
     def _describe_current(self, ampere: float) -> tuple[str, str]:
         """Return the likely cause of an impossible current [A], and a sentence with it."""

@@ -5,7 +5,7 @@ import contextlib
 import numpy as np
 from hypothesis import strategies as st
 
-from bms_estimator.forecast.forecast import unknown_values
+from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_slots import CellSlots
@@ -18,9 +18,9 @@ from bms_estimator.protocols.devices.vedirect import VeDirectProtocol
 from bms_estimator.protocols.firmware.messages import DELIMITER, Ack, Hello, ProtocolError, SampleMessage, seal, unseal
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from bms_estimator.protocols.registry import make_protocol
+from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.telemetry.alarms.measured_values import SampleBuffer
-from bms_estimator.telemetry.impossible import PackBounds
+from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from tests.fuzz.edited_seeds import edit, edited_seeds, load_seeds
 
 PACKETS = [unseal(frame) for data in load_seeds("frames") for frame in data.split(DELIMITER) if frame]
@@ -29,7 +29,7 @@ VERSION_AND_HELLO, VERSION_AND_SAMPLE = b"\x01\x01", b"\x01\x02"
 EDITED_PACKETS = edit(PACKETS, (VERSION_AND_HELLO, VERSION_AND_SAMPLE))
 FRAMES = st.lists((st.sampled_from(PACKETS) | EDITED_PACKETS).map(seal), min_size=1, max_size=6).map(b"".join)
 
-LFP = PackBounds.of(load_cell("lfp", 100.0).pack(4, 1))
+LFP = Estimator(load_cell("lfp", 100.0).pack(4, 1))
 
 
 def decode(protocol: DeviceProtocol, data: bytes) -> None:
@@ -122,11 +122,10 @@ def test_message_decoders_raise_only_protocol_errors(data: bytes) -> None:
 @edited_seeds("text", b"V=", b"I=", b"T=", b"cells=", b'{"voltage":', b";", b" mA", b"kV")
 def test_text_protocol_decodes_edited_bytes(data: bytes) -> None:
     decode(TextProtocol(), data)
-    decoder, buffer = TextProtocol(), SampleBuffer()
+    decoder, alarms = TextProtocol(), AlarmEvaluator(Settings(), LFP)
     samples = decoder.feed(0.0, data)
-    buffer.add(samples, np.zeros(0, TRACE), CellSlots(4).select(decoder.cells), unknown_values())
-    samples, _, _, cells = buffer.take()
-    LFP.find(samples, cells)
+    alarms.evaluate(samples, np.zeros(0, TRACE), CellSlots(4).select(decoder.cells), arrival_s=1.7e9)
+    alarms.changes()
 
 
 @edited_seeds("vedirect", b"\r\nV\t", b"\r\nI\t", b"\r\nChecksum\t", b":7F0", repair=with_vedirect_checksums)

@@ -17,8 +17,8 @@ from bms_estimator.mqtt.message import Message
 from bms_estimator.settings.mqtt import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from bms_estimator.telemetry.alarms.estimate_alarms import UNKNOWN_SOC
 from bms_estimator.telemetry.publish_window import REST_S
+from bms_estimator.telemetry.state import UNKNOWN_SOC
 from tests.home_assistant.conftest import DASHBOARD
 from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant
 from tests.home_assistant.packs import Packs

@@ -20,6 +20,7 @@ import pytest
 
 from bms_estimator.checkpoint.run_file import RunCounters, add_checksum
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
+from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.events import events
@@ -31,12 +32,10 @@ from bms_estimator.service import checkpoint_writer, relay_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import lacks_alarm
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
-from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.inputs import Inputs
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, edit_settings
 from tests.checkpoint.test_identity import CHECKPOINT_FILE
 from tests.collector import Collector
@@ -290,7 +289,7 @@ def test_damaged_alarms_are_recognized(latched: Path, tmp_path: Path, damage: st
 
 def restore_fails(alarms: str) -> bool:
     """Return True if an evaluator reports that alarms are missing, or raises an exception."""
-    evaluator = AlarmEvaluator(monitored_alarms(SETTINGS, CELL), 0.1, 5.0, Inputs(10.0, 1), 10.0)
+    evaluator = AlarmEvaluator(SETTINGS, Estimator(CELL))
     try:
         return bool(evaluator.restore(alarms))
     except Exception:  # noqa: BLE001 - the monitor catches any exception

@@ -1,24 +1,37 @@
 """Loss of a measured quantity, and the end of the loss."""
 
+import json
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
-from bms_estimator.telemetry.alarms.inputs import Inputs
+from bms_estimator.kernels.alarms.quantities import update_quantities
+from bms_estimator.kernels.alarms.records import ALARMS, LIMITS, LOG, NAMES, PART, SETTINGS, TEMPERATURE
+from bms_estimator.model.sample import SAMPLE
+from bms_estimator.telemetry.alarms.saved_state import decode
 
 
-def change_times_s(present: list[bool], step_s: float, inputs: Inputs) -> list[float]:
-    """Return the times at which the temperature was lost or measured again, with samples every ``step_s`` from 0 on."""
-    times_s = step_s * np.arange(len(present))
-    one = np.ones(len(present), dtype=np.int64)
-    counts = {"voltage": one, "current": one, "cells": one, "temperature": np.array(present, dtype=np.int64)}
-    return inputs.update(times_s, np.full(len(present), step_s), counts)
+def change_times_s(present: Sequence[bool], steps_s: float, lost_s: float = 10.0, *, lost: bool = True) -> list[float]:
+    """Return the times at which an alarm that needs the temperature is no longer watched, or watched again.
 
-
-def inputs_without_temperature() -> Inputs:
-    """Return the state of inputs that have lost the temperature."""
-    inputs = Inputs(lost_s=10.0, series=2)
-    inputs.restore({"temperature": [1, True]})
-    return inputs
+    Args:
+        present: True for each sample with a temperature.
+        steps_s: Interval between samples, the first of which is at 0 [s].
+        lost_s: Time without values after which the temperature is lost [s].
+        lost: True if the temperature is lost before the first sample.
+    """
+    alarms, limits, part, log = np.zeros(1, ALARMS), np.zeros(len(NAMES), LIMITS), np.zeros(1, PART), np.zeros(9, LOG)
+    limits["monitored"][0], limits["needs"][0] = 1, 1 << TEMPERATURE
+    settings, samples, scratch = np.zeros(1, SETTINGS), np.zeros(1, SAMPLE), np.zeros((6, 1))
+    settings["lost_s"], alarms["states"]["unwatched"][0, 0] = lost_s, lost
+    alarms["quantities"]["max_count"][0, TEMPERATURE], alarms["quantities"]["lost"][0, TEMPERATURE] = 1, lost
+    scratch[0] = steps_s
+    for i, is_present in enumerate(present):
+        samples["time_s"], scratch[1 + TEMPERATURE] = i * steps_s, is_present
+        update_quantities(alarms, limits, settings, part, samples, scratch, log, i * steps_s)
+    times_s: list[float] = log["at_s"][: part["logged"][0]].tolist()
+    return times_s
 
 
 @pytest.mark.parametrize(
@@ -33,7 +46,7 @@ def inputs_without_temperature() -> Inputs:
 def test_a_loss_ends_after_ten_seconds_of_samples_with_values(
     series: list[bool], step_s: float, restored_s: float
 ) -> None:
-    assert change_times_s(series, step_s, inputs_without_temperature()) == [restored_s]
+    assert change_times_s(series, step_s) == [restored_s]
 
 
 @pytest.mark.parametrize(
@@ -48,17 +61,18 @@ def test_a_loss_ends_after_ten_seconds_of_samples_with_values(
     ],
 )
 def test_rare_values_do_not_end_a_loss(series: list[bool], step_s: float) -> None:
-    assert change_times_s(series, step_s, inputs_without_temperature()) == []
+    assert change_times_s(series, step_s) == []
+
+
+def test_a_loss_ends_after_ten_seconds_of_values_also_if_it_begins_sooner() -> None:
+    present = [True] * 3 + [False] * 3 + [True] * 20
+    # the first missing value is at 3 s, the first one after the loss at 6 s
+    assert change_times_s(present, 1.0, lost_s=1.0, lost=False) == [4.0, 16.0]
 
 
 def test_gaps_count_neither_for_a_loss_nor_for_its_end() -> None:
-    inputs, one = inputs_without_temperature(), np.ones(50, dtype=np.int64)
-    counts = {"voltage": one, "current": one, "cells": one, "temperature": one}
-    assert inputs.update(100.0 * np.arange(50), np.zeros(50), counts) == []
-    assert inputs.lost == ("temperature",)
+    assert change_times_s([True] * 50, 0.0) == []
 
 
 def test_state_of_a_pack_with_more_cells_is_restored() -> None:
-    inputs = Inputs(lost_s=10.0, series=2)
-    inputs.restore({"cells": [16, True]})
-    assert (inputs.lost, inputs.saved_state) == (("cells",), {"cells": [2, True]})
+    assert decode(json.dumps({"inputs": {"cells": [16, True]}}), series=2).counts["cells"] == (2, True)

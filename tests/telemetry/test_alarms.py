@@ -10,6 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.alarms.evaluate import update_alarm
+from bms_estimator.kernels.alarms.records import ALARMS as STATES
+from bms_estimator.kernels.alarms.records import LIMITS, LOG, PART, RAISED, SETTINGS
+from bms_estimator.kernels.alarms.states import acknowledge
 from bms_estimator.kernels.cells.records import ReadingFault
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import CellModel, load_cell
@@ -17,21 +22,26 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.model.fuel_cell import load_fuel_cell
-from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.protocols.base.device_clock import MAX_LEAD_S
 from bms_estimator.protocols.base.probe_check import probe_block
-from bms_estimator.settings.alarm_limits import AlarmDefinition, implausible_limits, monitored_alarms
+from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.inputs import Inputs
-from bms_estimator.telemetry.alarms.measured_values import measured_values
-from bms_estimator.telemetry.alarms.sample_intervals import SampleCounts
-from bms_estimator.telemetry.alarms.state import AlarmState
 from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
-from tests.telemetry.alarm_captures import PACK, WALL_S, Line, ReplayResult, knee_lines, record, replayed, settings
+from tests.telemetry.alarm_captures import (
+    PACK,
+    WALL_S,
+    Line,
+    ReplayResult,
+    knee_lines,
+    record,
+    replayed,
+    settings,
+)
 
 NAN = math.nan
+NO_TRACE = np.zeros(0, TRACE)
 GOOD_CELLS = (3.70, 3.70)
 """Cell voltages that raise no alarm [V]."""
 WITHOUT_IDENTIFIER: dict[str, Any] = {"identifier": {"enabled": False}}
@@ -130,11 +140,13 @@ async def test_the_coldest_probe_raises_the_freezing_alarm(tmp_path: Path) -> No
     assert result.transitions("sensor_fault") == []
 
 
-def test_samples_with_only_a_mean_temperature_are_judged_by_it() -> None:
-    samples = np.zeros(2, dtype=SAMPLE)
-    samples["temperature_c"] = 70.0, -5.0
-    values = measured_values(samples, np.full((2, 3), NAN), charging_a=0.1)
-    assert values["over_temperature"].tolist() == values["under_temperature"].tolist() == [70.0, -5.0]
+@pytest.mark.parametrize(("temperature_c", "name"), [(70.0, "over_temperature"), (-25.0, "under_temperature")])
+def test_samples_with_only_a_mean_temperature_are_judged_by_it(temperature_c: float, name: str) -> None:
+    samples = np.zeros(100, dtype=SAMPLE)  # extremes of 0 degC, which do not enclose the mean
+    samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(100.0), 7.4, temperature_c
+    alarms = make_evaluator()
+    alarms.evaluate(samples, NO_TRACE, NO_CELLS, WALL_S)
+    assert alarms.active == (name,)
 
 
 def test_each_alarm_has_a_capture() -> None:
@@ -245,21 +257,36 @@ def _transitions(result: ReplayResult) -> list[tuple[float, str, bool]]:
     return [(change.at_s, change.alarm.name, change.alarm.active) for change in result.changes]
 
 
-def _take_values(
-    state: AlarmState, *values: float, step_s: float = 1.0, begin_s: float = 0.0
-) -> list[tuple[float, bool]]:
-    """Update the alarm with values every ``step_s``; return the times at which it is raised (True) or cleared."""
-    times_s = begin_s + step_s * np.arange(len(values))
-    steps_s = np.full(len(values), step_s)
-    return [
-        (change.at_s, change.raised is not None) for change in state.update(times_s, steps_s, np.array(values), WALL_S)
-    ]
+class KernelAlarm:
+    """State of an alarm with limit 10, clear level 8, and delays of 2 s and 3 s, except for ``changes``.
 
+    For ``sign`` = -1 all limits and values are negative, and the limit is a lower one.
+    """
 
-def _make_state(**changes: Any) -> AlarmState:
-    """Return the state of an alarm with limit 10, clear level 8, and delays of 2 s and 3 s, except for ``changes``."""
-    rule = {"severity": "warning", "limit": 10.0, "clear": 8.0, "delay_s": 2.0, "clear_delay_s": 3.0, "latch": False}
-    return AlarmState(AlarmDefinition(**{"name": "pack_over_voltage", **rule, **changes}))
+    def __init__(self, sign: float = 1.0, **changes: float) -> None:
+        self._alarms, self._part, self._log = np.zeros(1, STATES), np.zeros(1, PART), np.zeros(9, LOG)
+        self._limits, self._sign, self._time_s = np.zeros(1, LIMITS), sign, 0.0
+        rule = {"limit": 10.0, "clear": 8.0, "delay_s": 2.0, "clear_delay_s": 3.0, "latch": 0} | changes
+        for name, value in {"monitored": 1, "sign": sign, **rule}.items():
+            self._limits[name] = sign * value if name in ("limit", "clear") else value
+
+    def take(self, *values: float) -> list[tuple[float, bool]]:
+        """Process values at intervals of 1 s, the first of all at 0 s. Return the times of raising (True) and ending."""
+        for value in values:
+            tables = self._alarms, self._limits, np.zeros(1, SETTINGS), self._part, self._log
+            update_alarm(*tables, 0, self._time_s, 1.0, self._sign * value)
+            self._time_s += 1.0
+        return self._changes()
+
+    def acknowledge(self) -> list[tuple[float, bool]]:
+        """Acknowledge the alarm. Return the same as ``take``."""
+        acknowledge(self._alarms, self._part, self._log, 0, self._time_s)
+        return self._changes()
+
+    def _changes(self) -> list[tuple[float, bool]]:
+        entries = self._log[: self._part["logged"][0]]
+        self._part["logged"] = 0
+        return list(zip(entries["at_s"].tolist(), (entries["kind"] == RAISED).tolist(), strict=True))
 
 
 @pytest.mark.parametrize(
@@ -272,41 +299,27 @@ def _make_state(**changes: Any) -> AlarmState:
         ([11.0, 11.0, NAN, NAN, 11.0, 11.0], [(4.0, True)]),  # NaN adds nothing to the delay and does not restart it
         ([11.0] * 3 + [NAN] * 20, [(2.0, True)]),
         ([NAN] * 5, []),
+        ([11.0, 11.0, 9.0, 11.0, 11.0, 11.0, NAN, 7.0, 7.0, 7.0, 7.0, 11.0], [(5.0, True), (10.0, False)]),
     ],
 )
 def test_an_alarm_is_raised_at_its_limit_and_cleared_below_its_clear_level_after_delays(
     values: list[float], transitions: list[tuple[float, bool]]
 ) -> None:
-    """Values are one second apart. An alarm of a lower limit has the same transitions with negative values."""
-    assert _take_values(_make_state(), *values) == transitions
-    lower_limit = _make_state(name="pack_under_voltage", limit=-10.0, clear=-8.0)
-    assert _take_values(lower_limit, *(-value for value in values)) == transitions
-
-
-def test_transitions_do_not_depend_on_how_values_are_split_into_blocks() -> None:
-    values = [11.0, 11.0, 9.0, 11.0, 11.0, 11.0, NAN, 7.0, 7.0, 7.0, 7.0, 11.0]
-    state = _make_state()
-    one_by_one = [change for i, value in enumerate(values) for change in _take_values(state, value, begin_s=float(i))]
-    assert one_by_one == _take_values(_make_state(), *values) == [(5.0, True), (10.0, False)]
+    assert KernelAlarm().take(*values) == KernelAlarm(sign=-1.0).take(*values) == transitions
 
 
 def test_without_delay_and_hysteresis_each_crossing_is_a_transition() -> None:
-    state = _make_state(clear=10.0, delay_s=0.0, clear_delay_s=0.0)
-    assert _take_values(state, 9.0, 10.0, 9.9, 10.0) == [(1.0, True), (2.0, False), (3.0, True)]
+    alarm = KernelAlarm(clear=10.0, delay_s=0.0, clear_delay_s=0.0)
+    assert alarm.take(9.0, 10.0, 9.9, 10.0) == [(1.0, True), (2.0, False), (3.0, True)]
 
 
 def test_a_latched_alarm_ends_only_after_it_was_acknowledged() -> None:
-    state = _make_state(latch=True, delay_s=0.0, clear_delay_s=0.0)
-    assert _take_values(state, 11.0, 7.0) == [(0.0, True)]
-    assert state.cause_cleared
-    assert _take_values(state, 11.0) == []  # it is still raised
-    assert not state.cause_cleared
-    assert not state.acknowledge(), "the cause is still there"
-    assert _take_values(state, 7.0) == [(0.0, False)]
-    assert not state.acknowledge()
-    assert _take_values(state, 11.0, 7.0) == [(0.0, True)], "an earlier acknowledgment does not count"
-    assert state.acknowledge()
-    assert state.raised is None
+    alarm = KernelAlarm(latch=1, delay_s=0.0, clear_delay_s=0.0)
+    assert alarm.take(11.0, 7.0) == [(0.0, True)]
+    assert alarm.take(11.0) == alarm.acknowledge() == [], "the cause is there again"
+    assert alarm.take(7.0) == [(3.0, False)]
+    assert alarm.take(11.0, 7.0) == [(4.0, True)], "an earlier acknowledgment does not count"
+    assert alarm.acknowledge() == [(6.0, False)]
 
 
 async def test_a_gap_does_not_count_toward_a_delay_but_time_between_slow_samples_does(tmp_path: Path) -> None:
@@ -349,31 +362,26 @@ async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_pat
 
 def make_evaluator(alarms: dict[str, Any] | None = None, cell: CellModel = PACK) -> AlarmEvaluator:
     """Return an evaluator for a pack with these settings of the alarms. A silence of 10 s raises link_lost."""
-    return AlarmEvaluator(
-        monitored_alarms(settings(alarms), cell),
-        charging_a=0.2,
-        gap_s=5.0,
-        inputs=Inputs(lost_s=10.0, series=2),
-        silence_limit_s=10.0,
-    )
+    return AlarmEvaluator(settings(alarms), Estimator(cell))
 
 
 def test_text_of_a_raised_reading_fault_stays_while_only_its_numbers_change() -> None:
     alarms = make_evaluator({"cell_sensor_fault": {"delay_s": 0.0}}, load_cell("nmc", 10.0).pack(3, 1))
     for at_s, text in enumerate(["cell 2 is off by 0.1 V", "cell 2 is off by 0.1 V", "cell 2 is off by 0.2 V"]):
         fault = CellFault(0.1, (text,), ((1, ReadingFault.OFFSET),))
-        alarms.evaluate_cells(CellFaults(float(at_s), NO_CELL_FAULT, fault), WALL_S)
+        faults, samples = CellFaults(float(at_s), NO_CELL_FAULT, fault), np.zeros(1, SAMPLE)
+        samples["time_s"] = at_s
+        alarms.evaluate(samples, NO_TRACE, NO_CELLS, WALL_S, cell_faults=faults)
     (text,) = [alarm.text for alarm in alarms.report() if alarm.name == "cell_sensor_fault"]
     assert "cell 2 is off by 0.1 V" in text
 
 
-async def test_a_saturated_current_exceeds_any_limit() -> None:
+async def test_a_saturated_current_is_possible_and_exceeds_any_limit() -> None:
     alarms = make_evaluator({"discharge_over_current": {"delay_s": 0.0, "limit_a": 500.0}})
     block = np.zeros(2, dtype=SAMPLE)
-    block["time_s"], block["current_a"], block["voltage_v"] = [0.0, 0.1], 25.0, 7.4
+    block["time_s"], block["current_a"], block["voltage_v"] = [0.0, 0.1], [25.0, 1e6], 7.4
     block["status"] = [0, int(SampleStatus.CURRENT_SATURATED)]
-    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    alarms.evaluate(block, NO_TRACE, NO_CELLS, WALL_S)
     (change,) = alarms.changes()
     assert (change.alarm.name, change.at_s, change.alarm.value) == ("discharge_over_current", 0.1, None)
     assert change.alarm.since == iso_utc(WALL_S)
@@ -471,13 +479,6 @@ def test_only_its_own_acknowledgement_ends_over_temperature_while_the_hot_probe_
     alarms.acknowledge("over_temperature")
     add_samples(alarms, *range(200, 300), temperature_c=25.0, probes_c=(25.0,))
     assert "over_temperature" not in alarms.active
-
-
-def test_a_loss_ends_after_ten_seconds_of_values_also_if_it_begins_sooner() -> None:
-    inputs, present = Inputs(lost_s=1.0, series=1), np.array([1] * 3 + [0] * 3 + [1] * 20)
-    counts = {"temperature": present, **{name: np.zeros_like(present) for name in ("voltage", "current", "cells")}}
-    changed_s = inputs.update(np.arange(26.0), np.ones(26), counts)
-    assert changed_s == [4.0, 16.0]  # the first missing value is at 3 s, the first one after the loss at 6 s
 
 
 def test_a_saturated_voltage_exceeds_any_limit() -> None:
@@ -630,8 +631,7 @@ def add_samples(
     block["current_a"], block["status"] = current_a, status
     cells = np.tile(cells_v, (len(times_s), 1)) if cells_v else NO_CELLS
     probes = probe_block([[(reading_c, False) for reading_c in probes_c]] * len(times_s))
-    alarms.add(block, np.zeros(0, dtype=TRACE), cells, probes=probes)
-    alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    alarms.evaluate(block, NO_TRACE, cells, WALL_S, probes=probes)
 
 
 def test_alarms_are_unwatched_during_silence_and_the_first_10_s_of_samples() -> None:
@@ -836,6 +836,36 @@ def test_restarts_within_the_delay_of_a_critical_alarm_do_not_prevent_it() -> No
     assert not after.active, "a value below the limit restarts the delay"
 
 
+SAVED_BEFORE = (
+    '{"pack_over_voltage": {"since_s": 1699999983.0, "value": 8.6, "gone": true, "acknowledged": false, '
+    '"severity": "critical"}, "over_temperature": {"since_s": 1699999991.0, "value": 70.0, "gone": false, '
+    '"acknowledged": true, "severity": "critical"}, "link_lost": {"since_s": 1700000000.0, "value": 30.0, "gone": false, '
+    '"acknowledged": false, "severity": "warning"}, "inputs": {"voltage": [1, false], "current": [1, false], '
+    '"temperature": [1, false]}, "silence": "no cable", "pending": ["discharge_over_current"], "probes": 2}'
+)
+"""State that the version before saved: an alarm that is latched, one that is acknowledged, one whose delay runs, and a silence."""
+
+
+def test_a_state_of_the_version_before_keeps_alarms_delays_acknowledgements_and_losses() -> None:
+    alarms = make_evaluator({"over_temperature": {"latch": True}})
+    assert alarms.restore(SAVED_BEFORE) == ""
+    assert json.loads(alarms.saved_state) == json.loads(SAVED_BEFORE)
+    assert alarms.active == ("pack_over_voltage", "over_temperature", "link_lost")
+    reported = {alarm.name: alarm for alarm in alarms.report()}
+    assert (reported["pack_over_voltage"].latched, reported["pack_over_voltage"].value) == (True, 8.6)
+    assert reported["pack_over_voltage"].since == iso_utc(1699999983.0)
+    assert reported["discharge_over_current"].unwatched_reason == "no cable"
+    add_samples(alarms, 1.0, temperature_c=25.0, current_a=55.0, probes_c=(25.0,))
+    assert "discharge_over_current" in alarms.active, "its delay counts as elapsed"
+    add_samples(alarms, *range(2, 30), temperature_c=25.0, probes_c=(25.0,))
+    assert "sensor_fault" in alarms.active, "the second probe is missing"
+    add_samples(alarms, *range(30, 200), temperature_c=25.0, probes_c=(25.0, 25.0))
+    assert "over_temperature" not in alarms.active, "it was acknowledged"
+    assert "pack_over_voltage" in alarms.active, "it is latched"
+    assert "pack_over_voltage" in alarms.acknowledge(None)
+    assert "pack_over_voltage" not in alarms.active
+
+
 def test_damaged_saved_quantities_are_rejected() -> None:
     alarms = make_evaluator()
     with pytest.raises(ValueError, match="temperature: measured = -1"):
@@ -852,8 +882,7 @@ def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: flo
     for burst in range(12):
         block = np.zeros(2, dtype=SAMPLE)
         block["time_s"], block["voltage_v"] = 30.0 * burst + np.array([0.0, spacing_s]), 8.6 if burst >= 4 else 7.4
-        alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-        alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+        alarms.evaluate(block, NO_TRACE, NO_CELLS, WALL_S)
     transitions = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
     assert transitions == [150.0], "the first burst after which it has been over the limit for 10 s"
 
@@ -866,8 +895,7 @@ def test_isolated_gaps_do_not_count_toward_a_delay() -> None:
     block = np.zeros(len(times_s), dtype=SAMPLE)
     block["time_s"] = times_s
     block["voltage_v"] = np.where((block["time_s"] < 180.0) & (block["time_s"] > 10.0), 7.4, 8.6)
-    alarms.add(block, np.zeros(0, dtype=TRACE), NO_CELLS)
-    alarms.evaluate(WALL_S, SampleCounts(0, 0), InputFault(0), ())
+    alarms.evaluate(block, NO_TRACE, NO_CELLS, WALL_S)
     transitions = [change.at_s for change in alarms.changes() if change.alarm.name == "pack_over_voltage"]
     assert transitions == [226.0]  # 19 s before the gap of 20 s, and 6 s after it
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE, SampleStatus
+from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.protocols.base.reading import sample_json_line
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
 from bms_estimator.telemetry.impossible import PackBounds
@@ -38,8 +38,6 @@ CRITICAL = {
     "current": {"discharge_over_current", "charge_over_current", "charging_below_freezing"},
 }
 """Critical alarms by the quantity that they need."""
-NO_CELLS = np.array([[np.nan, np.nan, 0.0, np.nan]])
-"""Summary of the cell voltages of a sample without any."""
 
 
 @pytest.mark.parametrize(("line", "quantity", "hint"), IMPOSSIBLE.values(), ids=IMPOSSIBLE)
@@ -151,10 +149,4 @@ async def test_more_cells_than_in_series_raise_sensor_fault_and_leave_the_alarms
 def test_the_hint_of_an_impossible_voltage_without_cell_voltages(voltage_v: float, hint: str) -> None:
     samples = np.zeros(1, SAMPLE)
     samples["voltage_v"] = voltage_v
-    assert hint in PackBounds.of(LFP).find(samples, NO_CELLS)["voltage"].text
-
-
-def test_a_saturated_current_is_possible() -> None:
-    samples = np.zeros(1, SAMPLE)
-    samples["current_a"], samples["voltage_v"], samples["status"] = 1e6, 53.5, SampleStatus.CURRENT_SATURATED
-    assert PackBounds.of(LFP).find(samples, NO_CELLS) == {}
+    assert hint in PackBounds.of(LFP).describe("voltage", samples[0], NO_CELLS)[1]

@@ -7,15 +7,11 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.pack_model import load_any
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
-from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.inputs import Inputs
-from bms_estimator.telemetry.alarms.sample_intervals import SampleCounts
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
@@ -93,15 +89,12 @@ def test_the_alarm_is_raised_only_with_a_margin(three_hours: tuple[SampleBlock, 
     """SOC minus max(delta_1, delta_2) is below the limit long before the first margin."""
     block, cell = three_hours[0], file_with_ladder(0.1)
     limits = settings({"stability_margin_low": {"limit": 0.25, "clear": 0.3}})
-    alarms = AlarmEvaluator(
-        monitored_alarms(limits, cell), 0.2, 5.0, Inputs(lost_s=10.0, series=1), silence_limit_s=10.0
-    )
     estimator, active, low = Estimator(cell, identifier=IdentifierSettings(), initial_soc=1.0), [], []
+    alarms = AlarmEvaluator(limits, estimator)
     for begin in range(0, block.size, FIT_S):
         samples = block[begin : begin + FIT_S]
         trace = estimator.run(samples)
-        alarms.add(samples, trace, NO_CELLS)
-        alarms.evaluate(WALL_S + begin, SampleCounts(0, 0), InputFault(0), ())
+        alarms.evaluate(samples, trace, NO_CELLS, WALL_S + begin)
         low.append(trace["soc"][-1] - max(trace["delta_1"][-1], trace["delta_2"][-1]) < 0.25)
         active.append("stability_margin_low" in alarms.active)
         assert active[-1] == bool(np.isfinite(trace["stability_margin"][-1]))

@@ -6,16 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
-from bms_estimator.settings.alarm_limits import monitored_alarms
-from bms_estimator.telemetry.alarms.estimate_alarms import UNKNOWN_SOC
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.inputs import Inputs
-from bms_estimator.telemetry.alarms.sample_intervals import SampleCounts
-from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED
+from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC
 from tests.telemetry.alarm_captures import PACK, WALL_S, settings
 
 
@@ -23,8 +19,7 @@ class Pack:
     """Alarms of a pack whose estimates are given."""
 
     def __init__(self, saved_state: str = "", **soc_low: Any) -> None:
-        definitions = monitored_alarms(settings({"soc_low": soc_low}), PACK)
-        self.evaluator = AlarmEvaluator(definitions, 0.2, 5.0, Inputs(lost_s=10.0, series=2), silence_limit_s=10.0)
+        self.evaluator = AlarmEvaluator(settings({"soc_low": soc_low}), Estimator(PACK))
         self.evaluator.restore(saved_state)
         self._time_s = 0.0
 
@@ -47,8 +42,7 @@ class Pack:
         )
         trace["stability_margin"] = soc - delta if delta > 0.0 and delta_valid else np.nan
         self._time_s += seconds
-        self.evaluator.add(samples, trace, NO_CELLS)
-        self.evaluator.evaluate(WALL_S + self._time_s, SampleCounts(0, 0), InputFault(0), ())
+        self.evaluator.evaluate(samples, trace, NO_CELLS, WALL_S + self._time_s)
 
     def alarm(self, name: str = "soc_low") -> Alarm:
         """Return the payload of an alarm."""

@@ -8,7 +8,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,81 +17,24 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import make_estimator
-from bms_estimator.kernels.alarms import BROKEN_WIRE_V, LIMITS, NAMES, SETTINGS
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, assemble
 from bms_estimator.pack_model.slow_fit import SlowFit
-from bms_estimator.settings.alarm_limits import AlarmDefinition, min_charge_current_a, monitored_alarms, short_limit_a
+from bms_estimator.settings.alarm_limits import monitored_alarms, short_limit_a
+from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sampling import NO_LIMITS
-from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS
-from bms_estimator.telemetry.alarms.evaluator import SENSOR_SUSPECTS
-from bms_estimator.telemetry.alarms.inputs import QUANTITIES
-from bms_estimator.telemetry.impossible import PackBounds
+from bms_estimator.telemetry.alarms.definitions import AlarmDefinitions
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
 
 MAX_TYPES = 256
 """Maximum number of cached types. Creating a type that is not cached takes 50 ms."""
+LIVE_ALARMS: frozenset[AlarmName] = frozenset(("collapse_risk", "hook_failed", "alarm_state_lost"))
+"""Alarms that a worker does not evaluate. It has neither forecasts nor hooks nor a saved list of alarms."""
 Bytes = NDArray[np.uint8]
 Digest = tuple[int, int]
 """First 128 bits of a SHA-256 digest as two words."""
-
-
-class AlarmDefinitions(NamedTuple):
-    """Alarms that a worker evaluates for the packs of a type."""
-
-    by_position: dict[int, AlarmDefinition]
-    """Definition of each monitored alarm by its position in ``kernels.alarms.NAMES``."""
-    limits: NDArray[np.void]
-    """Shape (number of ``NAMES``,), dtype ``kernels.alarms.LIMITS``."""
-    settings: NDArray[np.void]
-    """Shape (1,), dtype ``kernels.alarms.SETTINGS``."""
-    bounds: PackBounds
-
-    @classmethod
-    def of(cls, settings: Settings, model: PackModel, gap_s: float) -> Self:
-        """Return the definitions for settings and model of a whole pack.
-
-        Args:
-            settings: Settings of the pack.
-            model: Model of the whole pack.
-            gap_s: Minimum length of a gap between samples [s].
-
-        Raises:
-            UserError: A clear level lies beyond its limit.
-        """
-        monitored = {each.name: each for each in monitored_alarms(settings, model)}
-        by_position = {k: monitored[name] for k, name in enumerate(NAMES) if name in monitored}
-        limits, bounds = np.zeros(len(NAMES), LIMITS), PackBounds.of(model)
-        for k, each in by_position.items():
-            needs = sum(1 << QUANTITIES.index(name) for name in each.kind.needs)
-            sign = 1.0 if each.kind.is_upper_limit else -1.0
-            numbers = (each.limit, each.clear, each.delay_s, each.clear_delay_s)
-            limits[k] = (1, each.severity == "critical", sign, *numbers, needs)
-        broken_v, n = BROKEN_WIRE_V * bounds.series, bounds.series
-
-        def limit(name: str, default: float) -> float:
-            return monitored[name].limit if name in monitored else default
-
-        values: dict[str, Any] = {
-            "gap_s": gap_s,
-            "lost_s": settings.alarms.lost_s,
-            "charging_a": min_charge_current_a(model),
-            "series": n,
-            "max_a": bounds.max_a,
-            "range_a": bounds.range_a,
-            "low_v": bounds.range_v[0],
-            "high_v": bounds.range_v[1],
-            "wire_v": limit("pack_under_voltage", broken_v),
-            "wire_low_cell_v": limit("cell_under_voltage", BROKEN_WIRE_V),
-            "wire_high_cell_v": limit("cell_over_voltage", np.inf),
-        }
-        values |= {"sensor_suspects": int(SENSOR_SUSPECTS), "model_suspects": int(MODEL_SUSPECTS)}
-        record = np.zeros(1, SETTINGS)
-        for name, value in values.items():
-            record[name] = value
-        return cls(by_position, limits, record, bounds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +178,8 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], adv
     digest = config_digest(settings, cell)
     estimator = type_estimator(settings, cell).bound_to_record(record["estimator"])
 
+    alarms = [each._replace(latch=False) for each in monitored_alarms(settings, cell) if each.name not in LIVE_ALARMS]
+
     def new_fit(estimator: Estimator, interval_s: float) -> SlowFit:
         return WorkerFit(estimator, interval_s, advance)
 
@@ -244,7 +188,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], adv
         config_digest=digest,
         state_digest=state_digest(settings, cell),
         pack=assemble(estimator, settings, new_fit, has_load=False),
-        alarms=AlarmDefinitions.of(settings, cell, float(estimator.settings["gap_s"][0])),
+        alarms=AlarmDefinitions.of(alarms, settings, cell, float(estimator.settings["gap_s"][0])),
         short_limit_a=short_limit_a(settings, cell),
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,

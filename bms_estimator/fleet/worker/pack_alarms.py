@@ -11,24 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.fleet.packs.pack_type import AlarmDefinitions, PackType
+from bms_estimator.fleet.packs.pack_type import PackType
 from bms_estimator.fleet.worker.block_result import AlarmMessage
-from bms_estimator.kernels import alarms as kernel
-from bms_estimator.kernels.alarms import CHANGE, COUNTS, NAMES, PART, SAMPLE_ALARMS
+from bms_estimator.kernels.alarms.evaluate import begin_time_base, mark_reported
+from bms_estimator.kernels.alarms.quantities import lost_quantities
+from bms_estimator.kernels.alarms.records import COUNTS, ENDED, NAMES, RAISED, WATCH_CHANGED
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.events import Event, EventText, fit_event, input_fault_events, soc_events, watch_event
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock, SampleStatus
-from bms_estimator.telemetry.alarms.alarm_list import LOSS_TEXTS
-from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, find_unknown
-from bms_estimator.telemetry.alarms.evaluator import SENSOR_SUSPECTS, WRONG_CLOCK_TEXT
-from bms_estimator.telemetry.alarms.inputs import QUANTITIES
-from bms_estimator.telemetry.alarms.measured_values import has_bit, summarize
+from bms_estimator.telemetry.alarms.causes import LOSS_TEXTS, find_unknown, suspect_texts
+from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIES, SENSOR_SUSPECTS, Evaluation
 from bms_estimator.telemetry.alarms.message import AlarmMessage as AlarmContent
-from bms_estimator.telemetry.alarms.message import alarm_payload
-from bms_estimator.telemetry.alarms.sensor_faults import PROBE_TEXT
-from bms_estimator.telemetry.alarms.state import RaisedAlarm
+from bms_estimator.telemetry.alarms.message import RaisedAlarm, alarm_payload
+from bms_estimator.telemetry.alarms.sensor_faults import PROBE_TEXT, WRONG_CLOCK_TEXT
 from bms_estimator.telemetry.cells import cell_faults
 from bms_estimator.telemetry.health import identifier_counters, last_anchor, last_change, suspicions
 
@@ -43,10 +40,10 @@ class PackAlarms:
     def __init__(self, record: NDArray[np.void]) -> None:
         self._alarms, self._estimator = record["alarms"], record["estimator"]
         self._states: NDArray[np.void] = self._alarms[0]["states"]
-        self._changes, self._scratch = np.zeros(len(NAMES), CHANGE), np.zeros((6, SAMPLE_ALARMS))
-        self._part = np.zeros(1, PART)
-        self._inputs: tuple[SampleBlock, CellBlock] = np.zeros(0, SAMPLE), NO_CELLS  # last samples of the block
-        self._has_changed = 0  # result of ``kernel.evaluate``
+        self._kernel = Evaluation()
+        self._samples: SampleBlock = np.zeros(0, SAMPLE)  # last samples of the block
+        self._impossible: list[str] = []  # descriptions of their impossible values
+        self._has_events = False  # the estimator has changed, which is an event
         self._cell_windows = self._fits = 0  # numbers before the block
 
     def begin_block(self, pack_type: PackType, *, is_new_time_base: bool) -> None:
@@ -57,9 +54,9 @@ class PackAlarms:
             is_new_time_base: True if the timestamps have another origin than those of the previous block.
         """
         if is_new_time_base:
-            kernel.begin_time_base(self._alarms)
-        if self._has_changed:
-            self._changes[...], self._has_changed = 0, 0
+            begin_time_base(self._alarms)
+        self._kernel.clear()
+        self._has_events = False
         self._cell_windows = int(pack_type.cells.bank["windows"][0])
         self._fits = pack_type.pack.slow_fit.changes if pack_type.pack.slow_fit else 0
 
@@ -75,24 +72,18 @@ class PackAlarms:
             trace: Their estimates.
             wall_offset_s: Wall clock of the edge minus the samples' clock [s].
         """
-        if self._scratch.shape[1] < samples.size:
-            self._scratch = np.zeros((6, samples.size))
-        slow_fit = pack_type.pack.slow_fit
-        self._part[0] = wall_offset_s, *self._cell_values(pack_type), slow_fit.weak_cell_std if slow_fit else math.nan
-        self._inputs = samples, cells_v
-        limits, settings = pack_type.alarms.limits, pack_type.alarms.settings
-        self._has_changed |= kernel.evaluate(
-            self._alarms,
-            limits,
-            settings,
-            self._part,
-            self._estimator,
-            samples,
-            cells_v,
-            trace,
-            self._scratch,
-            self._changes,
-        )
+        part, slow_fit = self._kernel.part[0], pack_type.pack.slow_fit
+        part["wall_offset_s"], part["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
+        part["cells_at_s"], part["short_a"], part["reading_v"] = self._cell_values(pack_type)
+        self._has_events |= self._kernel.run(self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace)
+        self._samples = samples
+        self._impossible = [
+            pack_type.alarms.bounds.describe(
+                name, samples[row - 1], cells_v[row - 1] if len(cells_v) == samples.size else NO_CELLS
+            )[1]
+            for name, row in zip(QUANTITIES, part["impossible"].tolist(), strict=True)
+            if row
+        ]
 
     def _cell_values(self, pack_type: PackType) -> tuple[float, float, float]:
         """Return time [s], self-discharge [A] and error of the readings [V] of a new estimate of the cells; NaN without one."""
@@ -124,20 +115,22 @@ class PackAlarms:
             is_whole: True: also about alarms that have been raised or unwatched since an earlier block.
         """
         slow_fit = pack_type.pack.slow_fit
-        if not (self._has_changed or is_whole or (slow_fit and slow_fit.changes > self._fits)):
+        entries = self._kernel.entries
+        if not (entries.size or self._has_events or is_whole or (slow_fit and slow_fit.changes > self._fits)):
             return ()
-        changes = self._changes
-        is_due = (changes["was_raised"] | changes["has_ended"] | changes["has_watch_changed"]) != 0
+        positions = set(entries["alarm"].tolist())
         if is_whole:
-            is_due |= (self._states["raised"] | self._states["unwatched"]) != 0
-        positions = set(np.flatnonzero(is_due).tolist()) & pack_type.alarms.by_position.keys()
+            positions |= set(np.flatnonzero(self._states["raised"] | self._states["unwatched"]).tolist())
+        positions &= pack_type.alarms.by_position.keys()
         about_alarms = (each for k in sorted(positions) for each in self._messages_of(k, pack_type, trace, now_s))
         return (*about_alarms, *(_event(text, now_s) for text in self._events(pack_type)))
 
     def _messages_of(self, k: int, pack_type: PackType, trace: TraceBlock, now_s: float) -> Iterator[AlarmMessage]:
         """Yield the messages about alarm ``k``: its raising in this block, and its present state, unless they are equal."""
-        state, change, definition = self._states[k], self._changes[k], pack_type.alarms.by_position[k]
-        lost = kernel.lost_quantities(self._alarms[0])
+        state, definition = self._states[k], pack_type.alarms.by_position[k]
+        entries = self._kernel.entries
+        changes = {int(entry["kind"]): entry for entry in entries[entries["alarm"] == k]}  # the last one of each kind
+        lost = lost_quantities(self._alarms[0])
         missing = [
             LOSS_TEXTS[name] for q, name in enumerate(QUANTITIES) if lost >> q & 1 and name in definition.kind.needs
         ]
@@ -159,15 +152,15 @@ class PackAlarms:
             )
 
         is_raised = bool(state["raised"])
-        if change["was_raised"]:
-            alarm = payload(change, is_raised=True)
+        if RAISED in changes:
+            alarm = payload(changes[RAISED], is_raised=True)
             yield _event(EventText("alarm_raised", f"{alarm.name}: {alarm.text}"), now_s)
             if not is_raised:
                 yield _message(alarm)
-        if change["has_ended"]:
+        if ENDED in changes:
             yield _event(EventText("alarm_cleared", definition.name), now_s)
         present = payload(state, is_raised=is_raised)
-        if change["has_watch_changed"]:
+        if WATCH_CHANGED in changes:
             yield _event(watch_event(present), now_s)
         yield _message(present)
 
@@ -180,14 +173,14 @@ class PackAlarms:
         former_faults = [fault.text for fault in InputFault(reported["suspects"])]
         yield from input_fault_events(former_faults, suspicions(record, pack_type.estimator.settings_record[0]))
         yield from soc_events(reported, identifier_counters(record), last_anchor(record))
-        kernel.mark_reported(self._alarms, self._estimator)
+        mark_reported(self._alarms, self._estimator)
 
     def _reasons(self, k: int, pack_type: PackType, lost: int) -> Iterator[str]:
         """Yield the causes of alarm ``k`` beyond its value, one sentence each."""
         name, cells = NAMES[k], pack_type.cells.deviations
         if name == "sensor_fault":
             yield from (LOSS_TEXTS[quantity] for q, quantity in enumerate(QUANTITIES) if lost >> q & 1)
-            yield from self._input_faults(pack_type.alarms)
+            yield from self._input_faults()
         if cells is not None and name in ("cell_short", "cell_sensor_fault"):
             faults = cell_faults(cells)
             yield from (faults.short if name == "cell_short" else faults.reading).texts
@@ -195,16 +188,14 @@ class PackAlarms:
             int(self._estimator["checks"]["suspects"][0])
         )
         if own:
-            texts = suspicions(self._estimator[0], pack_type.estimator.settings_record[0])
-            yield from (text for text in texts for suspect in own if text.endswith(suspect.text))
+            yield from suspect_texts(own, suspicions(self._estimator[0], pack_type.estimator.settings_record[0]))
 
-    def _input_faults(self, definitions: AlarmDefinitions) -> Iterator[str]:
+    def _input_faults(self) -> Iterator[str]:
         """Yield the faults of the last samples, one sentence each."""
-        samples, cells_v = self._inputs
         for bit, text in ((SampleStatus.WRONG_CLOCK, WRONG_CLOCK_TEXT), (SampleStatus.PROBE_FAULT, PROBE_TEXT)):
-            if has_bit(samples, bit).any():
+            if (self._samples["status"] & bit).any():
                 yield text
-        yield from (each.text for each in definitions.bounds.find(samples, summarize(cells_v, samples.size)).values())
+        yield from self._impossible
 
 
 def _message(alarm: Alarm) -> AlarmMessage:

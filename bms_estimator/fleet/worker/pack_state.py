@@ -16,7 +16,7 @@ from bms_estimator.estimator.restore import copy_known_fields
 from bms_estimator.fleet.fits.messages import COMPARED
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
-from bms_estimator.kernels.alarms import ALARMS
+from bms_estimator.kernels.alarms.records import ALARM, ALARMS
 from bms_estimator.kernels.cells.records import BANK, CELL
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
@@ -230,6 +230,11 @@ class UnpackedRecord:
                 other_fields[name] = value
         self.clear()
         copy_known_fields(self.record, other_fields)
+        states = self.record["alarms"]["states"]
+        for name in ALARM.names or ():  # an earlier version has the first ones of the alarms
+            saved = other_fields.get(f"alarms.states.{name}", states[name][:, :0])
+            if saved.ndim == states.ndim and saved.shape[1] < states.shape[1]:
+                states[name][:, : saved.shape[1]] = saved
         self._copy_cells(previous.record)
         if not has_same_estimator:
             return estimator_fields

@@ -1,242 +1,142 @@
-"""All alarms of a pack: their states, causes, payloads and changes.
-
-An alarm cannot be watched if a quantity that it needs is no longer measured.
-"""
+"""All alarms of a pack: their states, payloads and changes."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.input_faults import InputFault
+from bms_estimator.kernels.alarms.evaluate import raise_alarm, update_alarm
+from bms_estimator.kernels.alarms.quantities import lost_quantities, update_unwatched
+from bms_estimator.kernels.alarms.records import ALARMS, COLLAPSE_RISK, NAMES, RAISED, WATCH_CHANGED
+from bms_estimator.kernels.alarms.states import acknowledge
 from bms_estimator.model.payloads.snapshot import Alarm
-from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
-from bms_estimator.settings.alarm_limits import AlarmDefinition
+from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarms import AlarmName
-from bms_estimator.telemetry.alarms.inputs import Inputs
-from bms_estimator.telemetry.alarms.message import AlarmMessage, Change, alarm_payload
-from bms_estimator.telemetry.alarms.sensor_faults import FaultyInput
-from bms_estimator.telemetry.alarms.state import AlarmState, AlarmTransition, RaisedAlarm
-
-LOSS_TEXTS: dict[FaultyInput, str] = {
-    "voltage": "the voltage is no longer measured",
-    "current": "the current is no longer measured",
-    "temperature": "the temperature is no longer measured",
-    "cells": "cell voltages are missing that were measured before",
-}
-"""Description of the loss, by quantity."""
-
-
-@dataclass(frozen=True)
-class UnwatchedAlarms:
-    """Alarms that cannot be watched.
-
-    Attributes:
-        reasons: Reason by alarm.
-        loss_texts: Lost quantities, each with the alarms that need it, one sentence each.
-    """
-
-    reasons: dict[AlarmName, str] = field(default_factory=dict)
-    loss_texts: tuple[str, ...] = ()
-
-
-def find_unwatched(
-    names: Iterable[AlarmName], inputs: Inputs, silence_reason: str, input_faults: Mapping[FaultyInput, str]
-) -> UnwatchedAlarms:
-    """Return the alarms that cannot be watched because of silence or the loss of a quantity.
-
-    Args:
-        names: Names of the defined alarms.
-        inputs: State of the measured quantities.
-        silence_reason: Reason why no samples arrive; empty while they arrive.
-        input_faults: Description of each fault of the input, by quantity.
-    """
-    lost = inputs.lost
-    texts = LOSS_TEXTS | dict(input_faults)
-    reasons: dict[AlarmName, str] = {}
-    for name in names:
-        needed = ALARM_KINDS[name].needs
-        missing = [texts[each] for each in needed if each in lost]
-        if missing:
-            reasons[name] = "; ".join(missing)
-        elif silence_reason and needed and inputs.were_measured(needed):
-            reasons[name] = silence_reason
-    return UnwatchedAlarms(reasons, tuple(_loss_text(each, texts[each], reasons) for each in lost))
-
-
-def _loss_text(quantity: Quantity, text: str, unwatched: Iterable[AlarmName]) -> str:
-    """Describe a lost quantity and the unwatched alarms that need it."""
-    names = ", ".join(name for name in unwatched if quantity in ALARM_KINDS[name].needs)
-    return f"{text}: {names} cannot be raised" if names else text
-
+from bms_estimator.telemetry.alarms.causes import Causes
+from bms_estimator.telemetry.alarms.definitions import QUANTITIES, AlarmDefinitions, Evaluation
+from bms_estimator.telemetry.alarms.message import AlarmMessage, Change, RaisedAlarm, alarm_payload
+from bms_estimator.telemetry.alarms.saved_state import SavedState
 
 ALWAYS_WATCHED: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost", "alarm_state_lost"))
 """Alarms that are watched even before the first sample."""
 
 
-class Reasons(NamedTuple):
-    """Causes of an alarm beyond its value."""
-
-    suspects: InputFault
-    """Input faults that the filter suspects."""
-    texts: tuple[str, ...]
-    """Causes, one sentence each."""
-
-
-_NO_REASONS = Reasons(InputFault(0), ())
-
-
 class AlarmList:
-    """States of all alarms of one pack.
+    """All alarms of one pack. An alarm cannot be watched if a quantity that it needs is no longer measured.
 
     Args:
         definitions: Definitions of the alarms.
-        lost_s: Maximum time without values that counts toward a delay [s].
 
     Attributes:
-        states: State by name.
-        board_reason: Reason why the board's resets raise ``sensor_fault``; empty: none.
+        record: State of the alarms, shape (1,), dtype ``ALARMS``.
+        states: States of the alarms by position, dtype ``ALARM``; a view.
+        kernel: Call of the kernel that updates ``record``.
+        causes: Causes of the alarms.
+        positions: Position of each monitored alarm.
+        silence_reason: Reason why no samples arrive; empty while they arrive. ``set_silence`` changes it.
     """
 
-    def __init__(self, definitions: Sequence[AlarmDefinition], lost_s: float) -> None:
-        self.states = {each.name: AlarmState(each, lost_s=lost_s) for each in definitions}
-        self.board_reason = ""
-        self._unwatched = UnwatchedAlarms()
-        self._unknown: Mapping[AlarmName, str] = {}
-        self._input_faults: tuple[str, ...] = ()
-        self._reasons: dict[AlarmName, Reasons] = {}
+    def __init__(self, definitions: AlarmDefinitions) -> None:
+        self.definitions, self.kernel, self.causes = definitions, Evaluation(), Causes()
+        self.positions = {each.name: k for k, each in definitions.by_position.items()}
+        self.record: NDArray[np.void] = np.zeros(1, ALARMS)
+        self.states: NDArray[np.void] = self.record["states"][0]
+        self.silence_reason = ""
         self._changes: list[Change] = []
         self._unreported: dict[AlarmName, AlarmMessage] = {}
         self._payloads: dict[AlarmName, tuple[AlarmMessage, Alarm]] = {}  # rebuilt only when the message changes
 
     @property
+    def at_s(self) -> float:
+        """Time of the last sample [s]; 0 before the first."""
+        return float(self.record["samples"]["last_s"][0])
+
+    @property
     def active(self) -> tuple[AlarmName, ...]:
         """Names of all raised alarms."""
-        return tuple(name for name, state in self.states.items() if state.raised is not None)
+        return self._names_where(self.states["raised"] != 0)
+
+    @property
+    def pending(self) -> tuple[AlarmName, ...]:
+        """Names of the critical alarms whose delay runs."""
+        return self._names_where((self.states["raised"] == 0) & (self.states["holds"] != 0) & self._is_critical)
 
     @property
     def unwatched_critical(self) -> tuple[AlarmName, ...]:
-        """Names of critical alarms that cannot be watched, because a quantity is lost or unusable."""
-        return tuple(name for name in self._unwatched.reasons if self.states[name].definition.severity == "critical")
+        """Names of critical alarms that cannot be watched although their quantities were measured before."""
+        return self._names_where((self.states["unwatched"] != 0) & self._is_critical)
 
-    @property
-    def saved_state(self) -> dict[str, Any]:
-        """Raised alarms for ``restore`` after a restart."""
-        return {
-            name: {
-                **state.raised._asdict(),
-                "gone": state.cause_cleared,
-                "acknowledged": state.acknowledged,
-                "severity": state.definition.severity,
-            }
-            for name, state in self.states.items()
-            if state.raised is not None
-        }
+    def is_raised(self, name: AlarmName) -> bool:
+        """Return True if an alarm is raised."""
+        return bool(self.states["raised"][NAMES.index(name)])
 
-    @property
-    def pending(self) -> list[AlarmName]:
-        """Critical alarms whose delay runs."""
-        return [
-            name for name, each in self.states.items() if each.is_pending and each.definition.severity == "critical"
-        ]
-
-    def update(
-        self,
-        name: AlarmName,
-        times_s: Floats,
-        steps_s: Floats,
-        values: Floats,
-        wall_offset_s: float,
-        reason_at: Callable[[float], str] | None = None,
-        uncertain: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Process values of one alarm, if it is defined.
+    def raise_at(self, name: AlarmName, since_s: float, value: float = math.nan) -> None:
+        """Raise an alarm at the last sample without its delay, if it is monitored and not yet raised.
 
         Args:
             name: Name of the alarm.
-            times_s: Times on the samples' clock [s], shape (n,).
-            steps_s: Interval since the previous sample [s], 0 after a gap, shape (n,).
-            values: Values in the unit of the limit, NaN if not measured, shape (n,).
-            wall_offset_s: Wall clock minus the samples' clock [s].
-            reason_at: Function that returns the cause of an alarm that was raised at a time on the samples' clock [s].
-            uncertain: True where the true value may be beyond the limit, as in ``AlarmState.update``.
+            since_s: Wall clock [s since 1970].
+            value: Value in the unit of the alarm; NaN without a number.
         """
-        state = self.states.get(name)
-        if state is None:
-            return
-        for transition in state.update(times_s, steps_s, values, wall_offset_s, uncertain):
-            if transition.raised is not None and reason_at is not None:
-                self.set_reasons(name, reason_at(transition.at_s))
-            self._record(state, [transition])
+        kernel = self.kernel
+        raise_alarm(self.record, self.definitions.limits, kernel.part, kernel.log, NAMES.index(name), since_s, value)
+        self.take_changes()
 
-    def raise_at(self, name: AlarmName, at_s: float, raised: RaisedAlarm) -> None:
-        """Raise an alarm without its delay, if it is defined and not yet raised.
+    def update(self, name: AlarmName, passed_s: float, value: float, now_s: float) -> None:
+        """Process a value of an alarm that no sample contains.
 
         Args:
             name: Name of the alarm.
-            at_s: Time on the samples' clock [s].
-            raised: Time on the wall clock, and value.
+            passed_s: Time since the last value [s].
+            value: Value in the unit of the alarm.
+            now_s: Wall clock [s since 1970].
         """
-        state = self.states.get(name)
-        if state is not None:
-            self._record(state, state.raise_at(at_s, raised))
+        kernel, limits, settings = self.kernel, self.definitions.limits, self.definitions.settings
+        kernel.part["wall_offset_s"] = now_s - self.at_s
+        k = NAMES.index(name)
+        update_alarm(self.record, limits, settings, kernel.part, kernel.log, k, self.at_s, passed_s, value)
+        self.take_changes()
 
-    def acknowledge(self, name: AlarmName | None, at_s: float) -> list[AlarmName]:
-        """Acknowledge an alarm, or all alarms. Return their names. Alarms whose cause is gone end now.
+    def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
+        """Acknowledge an alarm; None: all. Return the acknowledged ones. Alarms whose cause is gone end now."""
+        acknowledged = [each for each in self.active if name in (None, each)]
+        for each in acknowledged:
+            acknowledge(self.record, self.kernel.part, self.kernel.log, self.positions[each], self.at_s)
+        self.take_changes()
+        return acknowledged
+
+    def set_silence(self, reason: str) -> None:
+        """Change ``silence_reason``, and with it the alarms that cannot be watched."""
+        self.silence_reason, self.kernel.part["is_silent"] = reason, bool(reason)
+        update_unwatched(self.record, self.definitions.limits, self.kernel.part, self.kernel.log, self.at_s)
+        self.take_changes()
+
+    def take_changes(self, reason_at: Callable[[float], str] = lambda _: "") -> None:
+        """Take the changes from the log of the kernel.
 
         Args:
-            name: Name of the alarm; None: all.
-            at_s: Time on the samples' clock [s].
+            reason_at: Returns the cause of the alarm ``collapse_risk`` that was raised at a time on the samples' clock [s].
         """
-        raised = [state for key, state in self.states.items() if state.raised and name in (None, key)]
-        for state in raised:
-            if state.acknowledge():
-                self._changes.append(Change(at_s, self._payload(state)))
-        return [state.definition.name for state in raised]
-
-    def set_reasons(self, name: AlarmName, *texts: str) -> None:
-        """Replace the causes of an alarm, one sentence each."""
-        self._reasons[name] = Reasons(InputFault(0), texts)
-
-    def set_suspects(self, name: AlarmName, suspects: InputFault, suspicions: Sequence[str]) -> None:
-        """Replace the causes of an alarm by the texts of suspected faults if their set has changed.
-
-        The numbers in the texts may change each second and are therefore not compared.
-
-        Args:
-            name: Name of the alarm.
-            suspects: Input faults that the filter suspects now and that raise this alarm.
-            suspicions: All suspected faults, one sentence each.
-        """
-        state, before = self.states.get(name), self._reasons.get(name, _NO_REASONS)
-        if state is not None and suspects != before.suspects and (suspects or state.raised is None):
-            # each sentence ends in the text of its fault; numbers may precede this text
-            texts = tuple(text for text in suspicions for suspect in suspects if text.endswith(suspect.text))
-            self._reasons[name] = Reasons(suspects, texts)
-
-    def set_input_faults(self, *texts: str) -> None:
-        """Replace the faults of the input that ``sensor_fault`` describes, one sentence each."""
-        self._input_faults = texts
-
-    def set_unwatched(self, unwatched: UnwatchedAlarms, at_s: float) -> None:
-        """Replace the alarms that cannot be watched, and record the changes at ``at_s`` on the samples' clock [s].
-
-        A critical alarm whose delay runs stays unwatched, so that a relay does not close before the alarm is raised.
-        """
-        before, pending = self._unwatched.reasons, self.pending
-        held = {name: reason for name, reason in before.items() if name in pending}
-        self._unwatched = UnwatchedAlarms(held | unwatched.reasons, unwatched.loss_texts)
-        for name in sorted(before.keys() ^ self._unwatched.reasons.keys()):
-            self._changes.append(Change(at_s, self._payload(self.states[name]), "watched"))
-
-    def set_unknown(self, reasons: Mapping[AlarmName, str]) -> None:
-        """Replace the alarms whose value is not known, each with the reason."""
-        self._unknown = reasons
+        has_reasons = False
+        for k, kind, at_s, since_s, value in self.kernel.entries.tolist():
+            definition = self.definitions.by_position[k]
+            if kind == WATCH_CHANGED:
+                if not has_reasons:
+                    self._set_unwatched_reasons()
+                    has_reasons = True
+                self._changes.append(Change(at_s, self._payload(k), "watched"))
+                continue
+            raised = _raised_alarm(since_s, value) if kind == RAISED else None
+            if raised and k == COLLAPSE_RISK:
+                self.causes.set_texts("collapse_risk", reason_at(at_s))
+            message = self.causes.message(definition.name, raised, cause_cleared=False)
+            if raised:
+                self._unreported[definition.name] = message
+            self._changes.append(Change(at_s, alarm_payload(definition, message)))
+        self.kernel.clear()
+        if self.causes.unwatched:  # the reason may have changed
+            self._set_unwatched_reasons()
 
     def changes(self) -> list[Change]:
         """Return the changes since the last call, oldest first."""
@@ -249,70 +149,67 @@ class AlarmList:
         An alarm that was raised since the last call is reported as raised, even if it has ended.
         """
         unreported, self._unreported = self._unreported, {}
+        states, unknown = self.states, self.causes.unknown
+        raised = states["raised"].tolist()
+        is_reported = (states["has_value"] | states["raised"] | states["unwatched"]).tolist()
         return tuple(
-            alarm_payload(state.definition, unreported[name])
-            if state.raised is None and name in unreported
-            else self._payload(state)
-            for name, state in self.states.items()
-            if state.has_value
-            or state.raised is not None
-            or name in self._unwatched.reasons
-            or name in self._unknown
-            or name in ALWAYS_WATCHED
+            alarm_payload(definition, unreported[definition.name])
+            if definition.name in unreported and not raised[k]
+            else self._payload(k)
+            for k, definition in self.definitions.by_position.items()
+            if is_reported[k] or definition.name in unknown or definition.name in ALWAYS_WATCHED
         )
 
-    def restore(self, saved: Mapping[AlarmName, Any], unwatched: UnwatchedAlarms) -> list[AlarmName]:
-        """Restore the ``saved_state`` of an earlier run and the alarms that cannot be watched.
+    def restore(self, saved: SavedState) -> None:
+        """Restore raised alarms, measured quantities and silence of an earlier run."""
+        for name, (max_count, lost) in saved.counts.items():
+            self.expect({name: max_count})
+            self.record["quantities"]["lost"][0, QUANTITIES.index(name)] = lost
+        self.set_silence(saved.silence_reason)
+        self._changes.clear()
+        for alarm in saved.raised.keys() & self.positions.keys():
+            for field, value in saved.raised[alarm].items():
+                self.states[field][self.positions[alarm]] = value
 
-        Returns:
-            Names of raised critical alarms that are not monitored, because of edited settings or of another version.
+    def resume_delay(self, name: AlarmName) -> None:
+        """Resume the delay of an earlier run. It counts as elapsed, so that a crash loop cannot prevent the alarm."""
+        if name in self.positions and not self.is_raised(name):
+            k = self.positions[name]
+            self.states["holds"][k], self.states["held_s"][k] = 1, math.inf
 
-        Raises:
-            ValueError, TypeError, LookupError: The saved state is damaged.
-        """
-        self._unwatched = unwatched
-        for name, entry in saved.items():
-            since_s, value, flags = float(entry["since_s"]), entry["value"], (entry["gone"], entry["acknowledged"])
-            iso_utc(since_s)  # raises ValueError for a time that cannot be published
-            if value is not None and not math.isfinite(value):
-                raise ValueError(f"{name}: value = {value}")
-            if not all(isinstance(flag, bool) for flag in flags):
-                raise TypeError(f"{name}: gone, acknowledged = {flags}")
-            if name in self.states:
-                raised = RaisedAlarm(since_s, None if value is None else float(value))
-                self.states[name].restore(raised, cause_cleared=flags[0], acknowledged=flags[1])
-        missing = [name for name in saved if name not in self.states]
-        # a former version saved no severity
-        return [name for name in missing if saved[name].get("severity", "critical") == "critical"]
+    def expect(self, counts: Mapping[Quantity, int]) -> None:
+        """Expect at least these numbers of values in a sample, because an earlier run measured them."""
+        for name, count in counts.items():
+            quantity = self.record["quantities"][0, QUANTITIES.index(name)]
+            quantity["max_count"] = max(quantity["max_count"], count)
 
-    def _record(self, state: AlarmState, transitions: Iterable[AlarmTransition]) -> None:
-        """Record transitions for ``changes``, and raised alarms for ``report``."""
-        for transition in transitions:
-            message = self._message(state, transition.raised, cause_cleared=False)
-            if transition.raised is not None:
-                self._unreported[state.definition.name] = message
-            self._changes.append(Change(transition.at_s, alarm_payload(state.definition, message)))
+    @property
+    def _is_critical(self) -> NDArray[np.bool_]:
+        return np.asarray(self.definitions.limits["critical"] != 0)
 
-    def _payload(self, state: AlarmState) -> Alarm:
-        """Return the payload of an alarm, cached until its message changes."""
-        name = state.definition.name
-        message = self._message(state, state.raised, cause_cleared=state.cause_cleared)
-        latest = self._payloads.get(name)
+    def _names_where(self, mask: NDArray[np.bool_]) -> tuple[AlarmName, ...]:
+        is_true = mask.tolist()
+        return tuple(name for name, k in self.positions.items() if is_true[k])
+
+    def _set_unwatched_reasons(self) -> None:
+        lost = lost_quantities(self.record[0])
+        names = self._names_where(self.states["unwatched"] != 0)
+        lost_names = tuple(name for q, name in enumerate(QUANTITIES) if lost >> q & 1)
+        self.causes.set_unwatched(names, lost_names, self.silence_reason)
+
+    def _payload(self, k: int) -> Alarm:
+        """Return the payload of alarm ``k``, cached until its message changes."""
+        definition, state = self.definitions.by_position[k], self.states[k]
+        raised, cause_cleared = None, False
+        if state["raised"]:
+            raised, cause_cleared = _raised_alarm(*state[["since_s", "value"]].item()), bool(state["cause_cleared"])
+        message = self.causes.message(definition.name, raised, cause_cleared=cause_cleared)
+        latest = self._payloads.get(definition.name)
         if latest is None or latest[0] != message:
-            latest = self._payloads[name] = message, alarm_payload(state.definition, message)
+            latest = self._payloads[definition.name] = message, alarm_payload(definition, message)
         return latest[1]
 
-    def _message(self, state: AlarmState, raised: RaisedAlarm | None, *, cause_cleared: bool) -> AlarmMessage:
-        """Return the changing content of the payload of an alarm."""
-        name = state.definition.name
-        faults: tuple[str, ...] = ()
-        if name == "sensor_fault":
-            board = (self.board_reason,) if self.board_reason else ()
-            faults = (*self._unwatched.loss_texts, *self._input_faults, *board)
-        return AlarmMessage(
-            raised,
-            cause_cleared=cause_cleared,
-            reasons=faults + self._reasons.get(name, _NO_REASONS).texts,
-            unwatched_reason=self._unwatched.reasons.get(name),
-            unknown_reason=self._unknown.get(name),
-        )
+
+def _raised_alarm(since_s: float, value: float) -> RaisedAlarm:
+    """Return time and value of a raised alarm. ``value`` is NaN without a number."""
+    return RaisedAlarm(since_s, None if math.isnan(value) else value)

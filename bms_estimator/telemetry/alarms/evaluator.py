@@ -4,107 +4,58 @@ Alarms evaluate each sample, not the published means, and use the samples' clock
 alarms as the live run. Alarms use raw values, including glitches that the estimator drops. The delays suppress single glitches.
 """
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
-from bms_estimator.kernels.alarms import BROKEN_WIRE_V, MAX_SPACING_FRACTION
-from bms_estimator.model.arrays import Floats
+from bms_estimator.kernels.alarms.records import CELLS, FAULTY_BOARD, LINK_LOST, NAMES
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
-from bms_estimator.model.sample import NO_PROBES, CellBlock, ProbeBlock, SampleBlock, SampleStatus
-from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
-from bms_estimator.settings.alarm_limits import STATE_LOST, AlarmDefinition
+from bms_estimator.model.sample import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock, SampleBlock, SampleStatus
+from bms_estimator.settings.alarm_kinds import Quantity
+from bms_estimator.settings.alarm_limits import STATE_LOST, monitored_alarms, silent_limit_s
 from bms_estimator.settings.alarms import AlarmName
-from bms_estimator.telemetry.alarms.alarm_list import AlarmList, find_unwatched
-from bms_estimator.telemetry.alarms.estimate_alarms import MODEL_SUSPECTS, CellAlarms, EstimateAlarms
-from bms_estimator.telemetry.alarms.inputs import Inputs, count_values
-from bms_estimator.telemetry.alarms.measured_values import (
-    UNUSABLE,
-    SampleBuffer,
-    WireLimits,
-    has_bit,
-    measured_values,
-    uncertain_values,
-)
+from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.alarms.alarm_list import AlarmList
+from bms_estimator.telemetry.alarms.causes import find_unknown, time_left_text
+from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIES, SENSOR_SUSPECTS, AlarmDefinitions
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.sample_intervals import FaultyFraction, SampleCounts, SampleIntervals
-from bms_estimator.telemetry.alarms.sensor_faults import FaultTexts, ProbeFaults
-from bms_estimator.telemetry.alarms.state import RaisedAlarm
+from bms_estimator.telemetry.alarms.saved_state import decode, encode
+from bms_estimator.telemetry.alarms.sensor_faults import WRONG_CLOCK_TEXT, ProbeFaults
 from bms_estimator.telemetry.cells import CellFaults
-from bms_estimator.telemetry.impossible import PackBounds
+from bms_estimator.telemetry.health import suspicions
 
-SENSOR_SUSPECTS = (
-    InputFault.SIGN_OF_CURRENT | InputFault.OFFSET | InputFault.OUTLIERS | InputFault.VOLTAGE | InputFault.CURRENT
-)
-"""Input faults that raise ``sensor_fault``."""
-INPUTS = "inputs"
-"""Key of the measured quantities in the saved state."""
-SILENCE = "silence"
-"""Key of the reason why no samples arrived, in the saved state."""
-PENDING = "pending"
-"""Key of the critical alarms whose delay runs, in the saved state."""
-PROBES = "probes"
-"""Key of the number of temperature probes, in the saved state. All keys but these four are names of alarms."""
 MIN_WATCHED_S = 10.0
 """Minimum duration of the samples after which alarms count as watched [s]. The delays of most critical alarms are not longer."""
-WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
-"""Text of a wrong clock that is right again at the end of a recorded block."""
 TEMPERATURE_ALARMS: frozenset[AlarmName] = frozenset(
     {"over_temperature", "under_temperature", "charging_below_freezing"}
 )
 """Alarms that a missing probe may hold."""
-_COLUMNS: dict[Quantity, str] = {"voltage": "voltage_v", "current": "current_a", "temperature": "temperature_c"}
-"""Column of SAMPLE by quantity."""
+_SUSPECTS: Mapping[AlarmName, InputFault] = {"sensor_fault": SENSOR_SUSPECTS, "model_mismatch": MODEL_SUSPECTS}
+"""Input faults that raise an alarm, by alarm."""
 
 
 class AlarmEvaluator:
     """Evaluator of all alarms of one pack.
 
     Args:
-        definitions: Definitions of the alarms.
-        charging_a: Minimum current into the pack that counts as charging [A].
-        gap_s: Minimum length of a gap between samples [s].
-        inputs: State of the measured quantities.
-        silence_limit_s: Time without a sample after which no alarm is watched [s].
-        bounds: Bounds of the possible values; None: every value is possible.
+        settings: Settings of the pack.
+        estimator: Estimator of the pack; read only.
 
-    Attributes:
-        rows: Number of samples that wait for ``evaluate``.
-        saved_state: State for ``restore`` after a restart, as JSON; empty if there is nothing to restore.
+    Raises:
+        UserError: A clear level lies beyond its limit.
     """
 
-    def __init__(
-        self,
-        definitions: Sequence[AlarmDefinition],
-        charging_a: float,
-        gap_s: float,
-        inputs: Inputs,
-        silence_limit_s: float,
-        bounds: PackBounds | None = None,
-    ) -> None:
-        self._alarms = AlarmList(definitions, inputs.lost_s)
-        self._charging_a = charging_a
-        self._inputs, self._silence_limit_s = inputs, silence_limit_s
-        self._bounds, self._input_faults, self._probe_faults = bounds, FaultTexts(), ProbeFaults()
-        self._silence_reason = ""  # reason why no samples arrive; empty while they do
+    def __init__(self, settings: Settings, estimator: Estimator) -> None:
+        model, gap_s = estimator.cell, float(estimator.settings["gap_s"][0])
+        self._alarms = AlarmList(AlarmDefinitions.of(monitored_alarms(settings, model), settings, model, gap_s))
+        self._estimator, self._probe_faults = estimator, ProbeFaults()
+        self._lost_s, self._silence_limit_s = settings.alarms.lost_s, silent_limit_s(settings)
         self._silence_s = -math.inf  # end of the last silence on the monotonic clock [s]
-        self._watched_s: float | None = (
-            None  # duration of the samples since the start or the last silence, without gaps
-        )
-        self._sample_intervals = SampleIntervals(gap_s)
-        self._estimates, self._cells = EstimateAlarms(self._alarms, charging_a, gap_s), CellAlarms(self._alarms)
-        self._buffer = SampleBuffer()
-        self._faulty_fraction = FaultyFraction()
-        self._at_s = 0.0  # time of the last sample
-        self._faulty_s = -math.inf  # time of the last sample with a fault of the input
-        self.saved_state = ""
 
     @property
     def is_watching(self) -> bool:
@@ -112,70 +63,72 @@ class AlarmEvaluator:
 
         A relay may only then follow the alarms, because before that a due alarm may not be raised yet.
         """
-        return (self._watched_s or 0.0) >= max(self._inputs.lost_s, MIN_WATCHED_S) and not self._alarms.pending
-
-    @property
-    def rows(self) -> int:
-        """Number of samples that wait for ``evaluate``."""
-        return self._buffer.size
-
-    def add(
-        self,
-        block: SampleBlock,
-        trace: TraceBlock,
-        cells: CellBlock,
-        forecasts: ForecastRows = NO_FORECAST,
-        cells_fault: str = "",
-        probes: ProbeBlock = NO_PROBES,
-    ) -> None:
-        """Buffer a block of samples for ``evaluate``.
-
-        Args:
-            block: Samples.
-            trace: Their estimates.
-            cells: Their cell voltages [V]; empty without any.
-            forecasts: Forecast at each row of ``trace``.
-            cells_fault: Reason why the cell voltages cannot be used; empty if they can.
-            probes: Their temperature probes; empty without any.
-        """
-        block = self._probe_faults.add(block, probes)
-        self._buffer.add(block, trace, cells, forecasts, cells_usable=not cells_fault)
-        if cells_fault:
-            self._input_faults.add("cells", cells_fault, cells_fault)
+        watched_s = float(self._alarms.kernel.part["watched_s"][0])  # NaN during a silence
+        return watched_s >= max(self._lost_s, MIN_WATCHED_S) and not self._alarms.pending
 
     def evaluate(
         self,
+        samples: SampleBlock,
+        trace: TraceBlock,
+        cells_v: CellBlock,
         arrival_s: float,
-        counts: SampleCounts,
-        suspects: InputFault,
-        suspicions: Sequence[str],
+        *,
+        forecasts: ForecastRows = NO_FORECAST,
+        probes: ProbeBlock = NO_PROBES,
+        cells_fault: str = "",
         clock_fault: str = "",
+        lost: int = 0,
+        cell_faults: CellFaults | None = None,
+        weak_cell_std: float = math.nan,
     ) -> None:
-        """Evaluate all buffered samples.
+        """Evaluate all alarms on a block, after the estimator has processed it.
 
         Args:
-            arrival_s: Arrival of the last buffered sample on the wall clock [s since 1970].
-            counts: Numbers of samples since start.
-            suspects: Input faults that the filter suspects now.
-            suspicions: The suspected faults, one sentence each.
+            samples: Samples.
+            trace: Their estimates.
+            cells_v: Their cell voltages [V]; empty without any.
+            arrival_s: Arrival of the last sample on the wall clock [s since 1970].
+            forecasts: Forecast at each row of ``trace``.
+            probes: Their temperature probes; empty without any.
+            cells_fault: Reason why the cell voltages cannot be used; empty if they can.
             clock_fault: Fault of the source's clock as a sentence; empty without one.
+            lost: Number of samples since start that were lost on the line.
+            cell_faults: New faults of single cells; None without a new estimate.
+            weak_cell_std: Deviation of the last discharge from the bank's reference [std]; NaN if unknown.
         """
-        if not self.rows:
+        if not samples.size:
             return
-        samples, trace, forecasts, cells = self._buffer.take()
-        if (samples["status"] & SampleStatus.WRONG_CLOCK).any():
-            self._input_faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
-        if probe_fault := self._probe_faults.take():
-            self._input_faults.add("temperature", "probe", probe_fault)
-        self._alarms.set_suspects("sensor_fault", suspects & SENSOR_SUSPECTS, suspicions)
-        self._alarms.set_suspects("model_mismatch", suspects & MODEL_SUSPECTS, suspicions)
-        if samples.size:
-            wall_offset_s = arrival_s - float(samples["time_s"][-1])
-            self._evaluate_samples(samples, cells, wall_offset_s)
-            self._evaluate_faulty_fraction(float(samples["time_s"][-1]), counts, suspects, wall_offset_s)
+        alarms, causes = self._alarms, self._alarms.causes
+        samples, was_faulty = self._probe_faults.add(samples, probes), alarms.is_raised("sensor_fault")
+        self._set_suspects()
+        part, times_s = alarms.kernel.part, samples["time_s"]
+        if cells_fault:
+            causes.input_faults.add("cells", cells_fault, cells_fault)
+        part["cells_unusable"] = bool(cells_fault)
+        alarms.record["faults"] |= (bool(cells_fault) << CELLS) | (bool(causes.board) << FAULTY_BOARD)
+        last_s = (
+            times_s[-1] if math.isfinite(times_s[-1]) else np.append(alarms.at_s, times_s[np.isfinite(times_s)])[-1]
+        )
+        part["wall_offset_s"], part["lost"], part["weak_cell_std"] = arrival_s - last_s, lost, weak_cell_std
+        part["cells_at_s"] = math.nan
+        if cell_faults:
+            short, reading = cell_faults.short, cell_faults.reading
+            part["cells_at_s"], part["short_a"], part["reading_v"] = cell_faults.at_s, short.value, reading.value
+            causes.set_cell_fault("cell_short", short, is_raised=alarms.is_raised("cell_short"))
+            causes.set_cell_fault("cell_sensor_fault", reading, is_raised=alarms.is_raised("cell_sensor_fault"))
+        risk = np.ascontiguousarray(forecasts["cutoff_within_5min"])
+        alarms.kernel.run(alarms.record, alarms.definitions, self._estimator.record, samples, cells_v, trace, risk)
+        self._describe_faults(samples, cells_v, clock_fault)
+        if part["inputs_evaluated"][0]:
+            causes.input_faults.end_interval(keep=was_faulty or alarms.is_raised("sensor_fault"))
         if trace.size:
-            self._estimates.evaluate(trace, forecasts, suspects, arrival_s - float(trace["time_s"][-1]))
-        self._save_state()
+            causes.unknown = find_unknown(trace[-1], soc_known=bool(alarms.record["soc_known"][0]))
+
+        def reason_at(at_s: float) -> str:
+            row = np.flatnonzero(trace["time_s"] == at_s)[-1]
+            return time_left_text(forecasts[min(row, forecasts.size - 1)])
+
+        alarms.take_changes(reason_at)
 
     def on_silence(self, silent_s: float, now_s: float, reason: str, steady_s: float) -> None:
         """Handle missing samples.
@@ -186,26 +139,21 @@ class AlarmEvaluator:
             reason: Reason for the silence; empty if unknown.
             steady_s: Monotonic clock [s].
         """
-        is_silent = silent_s >= self._silence_limit_s
+        alarms, is_silent = self._alarms, silent_s >= self._silence_limit_s
         if is_silent:
-            self._watched_s, self._silence_s = None, steady_s
-        elif self._silence_reason:  # alarms are raised before it ends, so that a relay does not close in between
+            alarms.kernel.part["watched_s"], self._silence_s = math.nan, steady_s
+        elif alarms.silence_reason:  # alarms are raised before it ends, so that a relay does not close in between
             # the first samples may have waited in the buffers of a suspended process
             is_silent = steady_s - self._silence_s < MIN_WATCHED_S or not self.is_watching
-        if is_silent != bool(self._silence_reason):
-            self._silence_reason = (reason or "no samples arrive") if is_silent else ""
-            self._update_unwatched(self._at_s)
-            self._save_state()
-        state = self._alarms.states.get("link_lost")
-        if state is None or silent_s < state.definition.limit:
+        if is_silent != bool(alarms.silence_reason):
+            alarms.set_silence((reason or "no samples arrive") if is_silent else "")
+        definition = alarms.definitions.by_position.get(LINK_LOST)
+        if definition is None or silent_s < definition.limit:
             return
-        if state.cause_cleared:  # the cause of a latched alarm has returned
-            state.cause_cleared = False
-            self._save_state()
-        if state.raised is None:
-            self._alarms.set_reasons("link_lost", *([reason] if reason else []))
-            self._alarms.raise_at("link_lost", self._at_s, RaisedAlarm(now_s, silent_s))
-            self._save_state()
+        alarms.states["cause_cleared"][LINK_LOST] = 0  # the cause of a latched alarm has returned
+        if not alarms.is_raised("link_lost"):
+            alarms.causes.set_texts("link_lost", *([reason] if reason else []))
+            alarms.raise_at("link_lost", now_s, silent_s)
 
     def evaluate_hooks(self, failing: Sequence[str], passed_s: float, now_s: float, *, is_undone: bool = False) -> None:
         """Evaluate the alarm ``hook_failed``.
@@ -216,13 +164,13 @@ class AlarmEvaluator:
             now_s: Wall clock [s since 1970].
             is_undone: True if a reset of the board has undone a relay level. It raises the alarm without its delay.
         """
+        alarms = self._alarms
         if failing:
-            self._alarms.set_reasons("hook_failed", *failing)
+            alarms.causes.set_texts("hook_failed", *failing)
         if is_undone:
-            self._alarms.raise_at("hook_failed", self._at_s, RaisedAlarm(now_s, None))
-        value = np.array([math.inf if failing else 0.0])  # this alarm publishes no value
-        self._alarms.update("hook_failed", np.array([self._at_s]), np.array([passed_s]), value, now_s - self._at_s)
-        self._save_state()
+            alarms.raise_at("hook_failed", now_s)
+        value = math.inf if failing else 0.0  # this alarm publishes no value
+        alarms.update("hook_failed", passed_s, value, now_s)
 
     def evaluate_resets(self, reason: str, now_s: float) -> None:
         """Raise ``sensor_fault`` without its delay while there is a reason.
@@ -231,33 +179,11 @@ class AlarmEvaluator:
             reason: Reason why the board's resets are a fault; empty: they are none.
             now_s: Wall clock [s since 1970].
         """
-        if reason == self._alarms.board_reason:
+        if reason == self._alarms.causes.board:
             return
-        self._alarms.board_reason = reason
+        self._alarms.causes.board = reason
         if reason:
-            self._alarms.raise_at("sensor_fault", self._at_s, RaisedAlarm(now_s, None))
-            self._save_state()
-
-    def evaluate_weak_cell(self, deviation_std: float, arrival_s: float) -> None:
-        """Evaluate the alarm ``weak_cell`` at the last sample.
-
-        Args:
-            deviation_std: Deviation of the last discharge from the bank's reference [std]; NaN if unknown.
-            arrival_s: Arrival of the last sample on the wall clock [s since 1970].
-        """
-        if not math.isnan(deviation_std):
-            self._cells.evaluate_weak_cell(deviation_std, self._at_s, arrival_s - self._at_s)
-            self._save_state()
-
-    def evaluate_cells(self, faults: CellFaults, arrival_s: float) -> None:
-        """Evaluate the alarms on faults of single cells.
-
-        Args:
-            faults: Faults at the last sample.
-            arrival_s: Arrival of this sample on the wall clock [s since 1970].
-        """
-        self._cells.evaluate(faults, arrival_s - faults.at_s)
-        self._save_state()
+            self._alarms.raise_at("sensor_fault", now_s)
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Acknowledge an alarm, or all alarms. Return their names. Alarms whose cause is gone end now.
@@ -265,15 +191,14 @@ class AlarmEvaluator:
         Args:
             name: Name of the alarm; None: all.
         """
-        acknowledged = self._alarms.acknowledge(name, self._at_s)
+        acknowledged = self._alarms.acknowledge(name)
         if "sensor_fault" in acknowledged and TEMPERATURE_ALARMS.isdisjoint((*self.active, *self._alarms.pending)):
             self._probe_faults.expected = 0  # a missing probe was removed
-        self._save_state()
         return acknowledged
 
     def names(self) -> tuple[AlarmName, ...]:
         """Return the names of all alarms."""
-        return tuple(self._alarms.states)
+        return tuple(self._alarms.positions)
 
     @property
     def active(self) -> tuple[AlarmName, ...]:
@@ -290,11 +215,23 @@ class AlarmEvaluator:
         return self._alarms.changes()
 
     def report(self) -> tuple[Alarm, ...]:
-        """Return all alarms that were ever watched.
+        """Return all alarms that were ever watched, or whose value is not known.
 
         An alarm that was raised since the last call is reported as raised, even if it has ended.
         """
         return self._alarms.report()
+
+    @property
+    def saved_state(self) -> str:
+        """State for ``restore`` after a restart, as JSON; empty if there is nothing to restore."""
+        alarms = self._alarms
+        return encode(
+            alarms.record[0],
+            alarms.definitions.by_position,
+            pending=alarms.pending,
+            silence_reason=alarms.silence_reason,
+            probes=self._probe_faults.expected,
+        )
 
     def restore(self, saved_state: str, crashed_s: float | None = None) -> str:
         """Restore the ``saved_state`` of an earlier run.
@@ -310,21 +247,16 @@ class AlarmEvaluator:
         Raises:
             ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError: The saved state is damaged.
         """
-        text = json.dumps(json.loads(saved_state or "{}"), ensure_ascii=False)
-        entries = json.loads(text.encode(errors="replace"))  # half of a UTF-16 pair could not be published
-        self._inputs.restore(entries.pop(INPUTS, {}))
-        self._silence_reason = str(entries.pop(SILENCE, ""))
-        self._probe_faults.expected = int(entries.pop(PROBES, 0))
-        pending = list(entries.pop(PENDING, []))
-        unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, {})
-        missing = self._alarms.restore(entries, unwatched)
-        missing += [name for name in pending if name not in self._alarms.states]
-        for name in pending:
-            if crashed_s is not None:
-                self._alarms.raise_at(name, self._at_s, RaisedAlarm(crashed_s, None))
-            elif state := self._alarms.states.get(name):
-                state.resume_delay()
-        self._save_state()
+        alarms = self._alarms
+        saved = decode(saved_state, series=alarms.definitions.bounds.series)
+        self._probe_faults.expected = saved.probes
+        alarms.restore(saved)
+        for name in saved.pending:
+            if crashed_s is None:
+                alarms.resume_delay(name)
+            elif name in alarms.positions:
+                alarms.raise_at(name, crashed_s)
+        missing = [name for name in (*saved.raised_critical, *saved.pending) if name not in alarms.positions]
         return f"no longer monitored, but raised or due before the restart: {', '.join(missing)}" if missing else ""
 
     def raise_state_lost(self, reason: str, now_s: float, measured: Mapping[Quantity, int]) -> None:
@@ -335,113 +267,34 @@ class AlarmEvaluator:
             now_s: Wall clock [s since 1970].
             measured: Number of values in a sample of the earlier run, by quantity. One that does not arrive is lost.
         """
-        self._inputs.expect(measured)
-        self._alarms.set_reasons(STATE_LOST.name, reason)
-        self._alarms.raise_at(STATE_LOST.name, self._at_s, RaisedAlarm(now_s, None))
-        self._alarms.states[STATE_LOST.name].cause_cleared = True  # an acknowledgement ends it at once
-        self._save_state()
+        alarms = self._alarms
+        alarms.expect(measured)
+        alarms.causes.set_texts(STATE_LOST.name, reason)
+        alarms.raise_at(STATE_LOST.name, now_s)
+        alarms.states["cause_cleared"][NAMES.index(STATE_LOST.name)] = 1  # an acknowledgement ends it at once
 
-    def _evaluate_samples(self, samples: SampleBlock, cells: Floats, wall_offset_s: float) -> None:
-        """Evaluate the alarms on measured values.
-
-        Args:
-            samples: Shape (n,), dtype SAMPLE.
-            cells: Minimum, maximum [V], number and mean [V] of the cell voltages, shape (n, 4).
-            wall_offset_s: Wall clock minus the samples' clock [s].
-        """
-        times_s = samples["time_s"]
-        self._at_s = float(times_s[-1])
-        passed_s, observed_s = self._sample_intervals.measure(times_s)
-        # the interval before the first sample is a part of the silence
-        self._watched_s = float(observed_s[1:].sum() if self._watched_s is None else self._watched_s + observed_s.sum())
-        samples, cells, unusable = self._without_impossible(samples, cells)
-        uncertain = uncertain_values(samples, cells, self._inputs.cells, self._wire_limits())
-        for name, series in measured_values(samples, cells, self._charging_a).items():
-            self._alarms.update(name, times_s, observed_s, series, wall_offset_s, uncertain=uncertain.get(name))
-        gaps_s = np.where(observed_s < passed_s, passed_s, 0.0)  # duration of the gap before each sample [s]; 0: no gap
-        self._alarms.update("link_lost", times_s, passed_s, gaps_s, wall_offset_s)
-        counts = {name: count_values(samples[column]) for name, column in _COLUMNS.items()}
-        counts["cells"] = cells[:, 2].astype(np.int64)
-        # with only faulty probes the temperature counts as missing also if it was never measured
-        unusable["temperature"] = has_bit(samples, SampleStatus.PROBE_FAULT) & np.isnan(samples["temperature_c"])
-        unusable["current"] = has_bit(samples, SampleStatus.CURRENT_SATURATED) | unusable.get("current", False)
-        is_wire_broken = samples["voltage_v"] < BROKEN_WIRE_V * self._inputs.series
-        is_saturated = has_bit(samples, SampleStatus.VOLTAGE_SATURATED)
-        unusable["voltage"] = is_wire_broken | is_saturated | unusable.get("voltage", False)
-        for quantity, rows in unusable.items():
-            counts[quantity][rows] = UNUSABLE
-        if self.unwatched_critical:  # the delay of one that waited for it may have ended
-            self._update_unwatched(self._at_s)
-        for at_s in self._inputs.update(times_s, observed_s, counts):
-            self._update_unwatched(at_s)
-            if self._is_blinded():  # without the delay of the alarm, because a quantity has been missing for ``lost_s``
-                self._alarms.raise_at("sensor_fault", at_s, RaisedAlarm(at_s + wall_offset_s, None))
-
-    def _wire_limits(self) -> WireLimits:
-        """Return the voltages that show a broken wire beside an alarm of the opposite side."""
-        limits_v = {name: state.definition.limit for name, state in self._alarms.states.items()}
-        broken_v = BROKEN_WIRE_V * self._inputs.series
-        return WireLimits(
-            limits_v.get("pack_under_voltage", broken_v),
-            limits_v.get("cell_under_voltage", BROKEN_WIRE_V),
-            limits_v.get("cell_over_voltage", math.inf),
-        )
-
-    def _without_impossible(
-        self, samples: SampleBlock, cells: Floats
-    ) -> tuple[SampleBlock, Floats, dict[Quantity, NDArray[np.bool_]]]:
-        """Return samples and cells with NaN in place of impossible values, and the rows of these values by quantity."""
-        found = self._bounds.find(samples, cells) if self._bounds else {}
-        if found:
-            samples, cells = samples.copy(), cells.copy()
-        for quantity, each in found.items():
-            self._input_faults.add(quantity, each.kind, each.text)
-            if quantity == "cells":
-                cells[each.rows, :2] = np.nan
-            else:
-                samples[_COLUMNS[quantity]][each.rows] = np.nan
-        return samples, cells, {quantity: each.rows for quantity, each in found.items()}
-
-    def _update_unwatched(self, at_s: float) -> None:
-        """Update the alarms that cannot be watched at ``at_s`` on the samples' clock [s]."""
-        unwatched = find_unwatched(self.names(), self._inputs, self._silence_reason, self._input_faults.texts)
-        self._set_input_faults()
-        self._alarms.set_unwatched(unwatched, at_s)
-
-    def _set_input_faults(self) -> None:
-        texts = self._input_faults.texts.items()
-        self._alarms.set_input_faults(*(text for name, text in texts if name not in self._inputs.lost))
-
-    def _is_blinded(self) -> bool:
-        """Return True if a quantity is lost that a critical alarm needs."""
-        lost = set(self._inputs.lost)
-        return any(not lost.isdisjoint(ALARM_KINDS[name].needs) for name in self.unwatched_critical)
-
-    def _evaluate_faulty_fraction(
-        self, at_s: float, counts: SampleCounts, suspects: InputFault, wall_offset_s: float
-    ) -> None:
-        """Evaluate the fraction of samples that are lost or unusable."""
-        if (fraction := self._faulty_fraction.update(at_s, counts)) is None:
+    def _set_suspects(self) -> None:
+        """Update the causes of the alarms that input faults raise, if the filter suspects other faults than before."""
+        record, alarms = self._estimator.record, self._alarms
+        bits = int(record["checks"]["suspects"][0])
+        if not (bits or alarms.causes.has_suspects):
             return
-        observed_s, value = fraction
-        state = self._alarms.states.get("sensor_fault")
-        has_fault = self._input_faults.update(keep=state is not None and state.raised is not None)
-        self._set_input_faults()
-        if suspects & SENSOR_SUSPECTS or has_fault or self._is_blinded() or self._alarms.board_reason:
-            value, self._faulty_s = math.inf, at_s  # above every limit
-        elif at_s - self._faulty_s <= MAX_SPACING_FRACTION * self._inputs.lost_s and state and state.raised is None:
-            value = math.nan  # a sample without a fault does not restart the delay of an intermittent one
-        self._alarms.update("sensor_fault", np.array([at_s]), observed_s, np.array([value]), wall_offset_s)
+        suspects = InputFault(bits)
 
-    def _save_state(self) -> None:
-        """Update ``saved_state``. With it, a relay that an alarm has opened stays open over a restart."""
-        saved: dict[str, Any] = self._alarms.saved_state
-        if inputs := self._inputs.saved_state:
-            saved[INPUTS] = inputs
-        if self._silence_reason:
-            saved[SILENCE] = self._silence_reason
-        if pending := self._alarms.pending:
-            saved[PENDING] = pending
-        if self._probe_faults.expected > 1:
-            saved[PROBES] = self._probe_faults.expected
-        self.saved_state = json.dumps(saved) if saved else ""
+        def texts() -> Sequence[str]:
+            return suspicions(record[0], self._estimator.settings_record[0])
+
+        for name, faults in _SUSPECTS.items():
+            alarms.causes.set_suspects(name, suspects & faults, texts, is_raised=alarms.is_raised(name))
+
+    def _describe_faults(self, samples: SampleBlock, cells_v: CellBlock, clock_fault: str) -> None:
+        """Describe faults of the clock, of probes and of impossible values in a block that the kernel has processed."""
+        faults, alarms = self._alarms.causes.input_faults, self._alarms
+        if int(np.bitwise_or.reduce(samples["status"])) & SampleStatus.WRONG_CLOCK:
+            faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
+        if probe_fault := self._probe_faults.take():
+            faults.add("temperature", "probe", probe_fault)
+        for quantity, row in zip(QUANTITIES, alarms.kernel.part["impossible"][0].tolist(), strict=True):
+            if row:
+                cells = cells_v[row - 1] if len(cells_v) == samples.size else NO_CELLS
+                faults.add(quantity, *alarms.definitions.bounds.describe(quantity, samples[row - 1], cells))

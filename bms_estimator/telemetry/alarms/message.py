@@ -6,7 +6,16 @@ from typing import Literal, NamedTuple
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.alarm_limits import AlarmDefinition
-from bms_estimator.telemetry.alarms.state import RaisedAlarm
+
+
+class RaisedAlarm(NamedTuple):
+    """Time and value at which an alarm was raised."""
+
+    since_s: float
+    """Time on the wall clock at which the alarm was raised [s since 1970]."""
+    value: float | None
+    """Value in the unit of the alarm; None if the alarm has no number."""
+
 
 LATCHED = "the cause is gone; acknowledge it to end it: "
 """Prefix of the text of a latched alarm."""

@@ -13,6 +13,8 @@ FaultyInput = Quantity | Literal["time"]
 """Faulty quantity of the samples."""
 PROBE_TEXT = "a temperature probe is broken, loose or missing, or far from the others: check it"
 """Fault of temperature probes, and its remedy."""
+WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
+"""Text of a wrong clock that is right again at the end of a recorded block."""
 RESET_WINDOW_S = 1800.0
 """Time within which resets count as repeated [s]. It covers three resets at the longest waiting time of the relay."""
 MIN_RESETS = 3
@@ -45,8 +47,8 @@ class FaultTexts:
         if name not in self._faults or self._faults[name].kind != kind:
             self._faults[name] = _Fault(kind, text)
 
-    def update(self, *, keep: bool) -> bool:
-        """Begin the next interval. Return True if the last one had a fault.
+    def end_interval(self, *, keep: bool) -> None:
+        """Begin the next interval.
 
         Args:
             keep: True: keep the texts of faults that have ended.
@@ -54,7 +56,6 @@ class FaultTexts:
         present, self._present = self._present, set()
         if not keep:
             self._faults = {name: fault for name, fault in self._faults.items() if name in present}
-        return bool(present)
 
     @property
     def texts(self) -> Mapping[FaultyInput, str]:

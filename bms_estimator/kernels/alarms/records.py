@@ -1,0 +1,169 @@
+"""Names, states, definitions and changes of alarms."""
+
+import numpy as np
+
+NAMES = (
+    *("pack_over_voltage", "pack_under_voltage", "cell_over_voltage", "cell_under_voltage", "cell_imbalance"),
+    *("discharge_over_current", "charge_over_current"),
+    *("over_temperature", "under_temperature", "charging_below_freezing", "link_lost"),
+    *("soc_low", "stability_margin_low", "model_mismatch"),
+    *("cell_short", "cell_sensor_fault", "weak_cell", "sensor_fault"),
+    *("collapse_risk", "hook_failed", "alarm_state_lost"),
+)
+"""Names of the alarms by their positions. States are saved by position, so that further alarms are appended."""
+SAMPLE_ALARMS = 11
+"""Number of alarms on the values of a sample, which come first."""
+LINK_LOST = NAMES.index("link_lost")
+SOC_LOW, MARGIN_LOW, MISMATCH = (NAMES.index(name) for name in ("soc_low", "stability_margin_low", "model_mismatch"))
+CELL_SHORT, CELL_READING = NAMES.index("cell_short"), NAMES.index("cell_sensor_fault")
+WEAK_CELL, SENSOR_FAULT = NAMES.index("weak_cell"), NAMES.index("sensor_fault")
+COLLAPSE_RISK = NAMES.index("collapse_risk")
+VOLTAGE, CURRENT, TEMPERATURE, CELLS = range(4)
+"""Positions of the measured quantities."""
+QUANTITIES = 4
+FAULTY_CLOCK, FAULTY_PROBE, FAULTY_BOARD = 4, 5, 6
+"""Bits of ``faults`` beside those of the measured quantities."""
+RAISED, ENDED, WATCH_CHANGED = 1, 2, 3
+"""Kinds of changes: raised, ended, no longer watched or watched again."""
+
+ALARM = np.dtype(
+    [
+        ("raised", "i8"),  # 1: raised
+        ("has_value", "i8"),  # 1: a value has arrived
+        ("holds", "i8"),  # 1: the condition of the next state holds
+        ("unwatched", "i8"),  # 1: a quantity that the alarm needs is lost
+        ("since_s", "f8"),  # time at which it was raised [s since 1970]
+        ("value", "f8"),  # value when it was raised; NaN without a number
+        ("held_s", "f8"),  # time for which the condition has held [s]
+        ("missing_s", "f8"),  # time without values since the last value [s]
+        ("cause_cleared", "i8"),  # 1: the cause is gone, but the alarm is latched
+        ("acknowledged", "i8"),  # 1: acknowledged, so that it ends once its cause is gone
+        ("is_uncertain", "i8"),  # 1: the last value was uncertain, and the measured one not beyond the limit
+        # 1: acknowledged at an uncertain value, and no measured value has been beyond the limit since
+        ("accepts_uncertain", "i8"),
+    ],
+    align=True,
+)
+"""State of an alarm."""
+INTERVALS = np.dtype(
+    [
+        ("started", "i8"),  # 1: a time is known
+        ("last_s", "f8"),  # last time [s]
+        ("step_s", "f8"),  # last interval above 0 [s]; 0: none
+        ("longest_s", "f8"),  # longest recent interval [s]
+        ("longest_at_s", "f8"),  # time of the last interval that is about as long [s]
+    ],
+    align=True,
+)
+"""Intervals between times."""
+QUANTITY = np.dtype(
+    [
+        ("max_count", "i8"),  # largest number of values in a sample; 0: never measured
+        ("lost", "i8"),  # 1: values have been missing for longer than the delay
+        ("is_missing", "i8"),  # 1: the last sample lacked values
+        ("missing_s", "f8"),  # time since the first of the last samples that lack values [s]
+        ("is_restored", "i8"),  # 1: a value has arrived since the loss
+        ("restored_s", "f8"),  # time with values since the loss [s]
+        ("value_age_s", "f8"),  # time since the last value of a lost quantity [s]
+    ],
+    align=True,
+)
+"""State of a measured quantity."""
+COUNTS = np.dtype(
+    [
+        ("full_anchors", "i8"),
+        ("empty_anchors", "i8"),
+        ("searched", "i8"),  # re-initializations of the SOC
+        ("reset", "i8"),  # restorations of the filter's last good state
+        ("suspects", "i8"),  # bits of ``InputFault``
+    ],
+    align=True,
+)
+"""Values of the estimator whose changes are events."""
+ALARMS = np.dtype(
+    [
+        ("states", ALARM, (len(NAMES),)),
+        ("quantities", QUANTITY, (QUANTITIES,)),
+        ("samples", INTERVALS),  # of samples
+        ("estimates", INTERVALS),  # of accepted samples
+        ("cells", INTERVALS),  # of evaluations of the single cells
+        ("bank", INTERVALS),  # of evaluations of the weak cell of a bank
+        ("fraction", INTERVALS),  # of evaluations of ``sensor_fault``
+        ("model_suspected", "i8"),  # 1: the filter suspected the cell model at the last evaluation
+        ("soc_known", "i8"),  # 1: the SOC was known at the last estimate
+        ("accepted", "i8"),  # counts of accepted and unusable samples at the last evaluation of ``sensor_fault``
+        ("unusable", "i8"),
+        ("faults", "i8"),  # bits of the faulty inputs since then
+        ("is_faulty", "i8"),  # 1: an input was faulty at ``faulty_s``
+        ("faulty_s", "f8"),  # time of the last sample with a faulty input [s]
+        ("reported", COUNTS),  # counts whose changes have been reported as events
+    ],
+    align=True,
+)
+"""State of all alarms of a pack. All fields are 0 before the first sample."""
+LIMITS = np.dtype(
+    [
+        ("monitored", "i8"),  # 1: the alarm is monitored
+        ("critical", "i8"),
+        ("sign", "f8"),  # 1: upper limit; -1: lower limit
+        ("limit", "f8"),
+        ("clear", "f8"),  # level at which the alarm ends
+        ("delay_s", "f8"),
+        ("clear_delay_s", "f8"),
+        ("needs", "i8"),  # bits of the quantities without which it cannot be evaluated
+        ("latch", "i8"),  # 1: it ends only after an acknowledgement
+    ],
+    align=True,
+)
+"""Definition of an alarm."""
+SETTINGS = np.dtype(
+    [
+        ("gap_s", "f8"),  # minimum length of a gap between samples [s]
+        ("lost_s", "f8"),  # time without values after which a quantity is lost [s]
+        ("charging_a", "f8"),  # minimum current that counts as charging [A]
+        ("series", "f8"),  # cells in series
+        ("max_a", "f8"),  # highest possible current [A]
+        ("range_a", "f8"),  # highest usual current [A]
+        ("low_v", "f8"),  # lowest and highest usual voltage of the pack [V]
+        ("high_v", "f8"),
+        ("wire_v", "f8"),  # voltages that show a broken wire beside an alarm of the opposite side [V]
+        ("wire_low_cell_v", "f8"),
+        ("wire_high_cell_v", "f8"),
+        ("sensor_suspects", "i8"),  # bits of the input faults that raise ``sensor_fault``
+        ("model_suspects", "i8"),  # bits of the input faults that raise ``model_mismatch``
+    ],
+    align=True,
+)
+"""Settings of the evaluation of a pack's alarms."""
+PART = np.dtype(
+    [
+        ("wall_offset_s", "f8"),  # wall clock minus the samples' clock [s]
+        ("cells_at_s", "f8"),  # time of a new estimate of the single cells [s]; NaN: none
+        ("short_a", "f8"),  # largest proven self-discharge of a cell [A]
+        ("reading_v", "f8"),  # largest error of a reading of a cell [V]
+        ("weak_cell_std", "f8"),  # deviation of a bank's last discharge from its reference [std]; NaN: unknown
+        ("lost", "i8"),  # number of samples since start that were lost on the line
+        ("is_silent", "i8"),  # 1: no samples arrive, or have arrived for a short time only
+        ("cells_unusable", "i8"),  # 1: samples without cell voltages have some that cannot be used
+        # duration of the samples since the start or the last silence, without gaps; NaN during a silence [s]; updated
+        ("watched_s", "f8"),
+        # results: entries of the log, 1 after an evaluation of ``sensor_fault``, and for each quantity the index of the last
+        # sample with an impossible value, plus 1
+        ("logged", "i8"),
+        ("inputs_evaluated", "i8"),
+        ("impossible", "i8", (QUANTITIES,)),
+    ],
+    align=True,
+)
+"""Values beside the samples of a part of a block, and results."""
+LOG = np.dtype(
+    [
+        ("alarm", "i8"),  # position in ``NAMES``
+        ("kind", "i8"),  # ``RAISED``, ``ENDED`` or ``WATCH_CHANGED``
+        ("at_s", "f8"),  # time on the samples' clock [s]
+        ("since_s", "f8"),  # time at which it was raised [s since 1970]
+        ("value", "f8"),  # value at which it was raised; NaN without a number
+    ],
+    align=True,
+)
+"""Change of an alarm."""

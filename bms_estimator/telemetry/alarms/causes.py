@@ -1,0 +1,147 @@
+"""Causes of alarms: suspected and impossible inputs, faults of cells, losses of measured quantities, and unknown values."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from bms_estimator.model.input_faults import InputFault
+from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
+from bms_estimator.settings.alarms import AlarmName
+from bms_estimator.telemetry.alarms.message import AlarmMessage, RaisedAlarm
+from bms_estimator.telemetry.alarms.sensor_faults import FaultTexts, FaultyInput
+from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault
+from bms_estimator.telemetry.state import UNKNOWN_SOC, missing_margin_reason
+
+LOSS_TEXTS: dict[FaultyInput, str] = {
+    "voltage": "the voltage is no longer measured",
+    "current": "the current is no longer measured",
+    "temperature": "the temperature is no longer measured",
+    "cells": "cell voltages are missing that were measured before",
+}
+"""Description of the loss, by quantity."""
+
+
+class Causes:
+    """Causes of the alarms of one pack.
+
+    Attributes:
+        input_faults: Faults of the input that ``sensor_fault`` describes.
+        board: Reason why the board's resets raise ``sensor_fault``; empty: none.
+        unwatched: Alarms that cannot be watched, each with the reason.
+        unknown: Alarms whose value is not known, each with the reason.
+    """
+
+    def __init__(self) -> None:
+        self.input_faults, self.board = FaultTexts(), ""
+        self.unwatched: Mapping[AlarmName, str] = {}
+        self.unknown: Mapping[AlarmName, str] = {}
+        self._lost: tuple[Quantity, ...] = ()
+        self._texts: dict[AlarmName, tuple[str, ...]] = {}
+        self._suspects: dict[AlarmName, InputFault] = {}  # faults that the text of an alarm describes
+        self._cell_faults: dict[AlarmName, CellFault] = {}
+
+    @property
+    def has_suspects(self) -> bool:
+        """True if the causes of an alarm are suspected faults."""
+        return any(self._suspects.values())
+
+    def set_texts(self, name: AlarmName, *texts: str) -> None:
+        """Replace the causes of an alarm, one sentence each."""
+        self._texts[name] = texts
+
+    def set_suspects(
+        self, name: AlarmName, suspects: InputFault, suspicions: Callable[[], Sequence[str]], *, is_raised: bool
+    ) -> None:
+        """Replace the causes of an alarm by the texts of suspected faults if their set has changed.
+
+        The numbers in the texts may change each second and are therefore not compared.
+
+        Args:
+            name: Name of the alarm.
+            suspects: Input faults that the filter suspects now and that raise this alarm.
+            suspicions: Returns all suspected faults, one sentence each.
+            is_raised: True if the alarm is raised.
+        """
+        if suspects != self._suspects.get(name, InputFault(0)) and (suspects or not is_raised):
+            self._suspects[name] = suspects
+            self._texts[name] = suspect_texts(suspects, suspicions())
+
+    def set_cell_fault(self, name: AlarmName, fault: CellFault, *, is_raised: bool) -> None:
+        """Replace the causes of an alarm by faults of single cells.
+
+        The text of a raised alarm changes only with the kinds of its faults, because its numbers change often.
+        """
+        described = self._cell_faults.get(name, NO_CELL_FAULT)
+        if not is_raised or (fault.kinds and fault.kinds != described.kinds):
+            self._texts[name], self._cell_faults[name] = fault.texts, fault
+
+    def set_unwatched(self, names: Iterable[AlarmName], lost: tuple[Quantity, ...], silence_reason: str) -> None:
+        """Replace the alarms that cannot be watched.
+
+        Args:
+            names: Names of these alarms.
+            lost: Lost quantities.
+            silence_reason: Reason why no samples arrive; empty while they arrive.
+        """
+        self._lost, texts = lost, self._loss_texts
+        reasons = {}
+        for name in names:
+            missing = "; ".join(texts[each] for each in ALARM_KINDS[name].needs if each in lost)
+            # an alarm that waits for the end of its delay keeps its reason
+            reasons[name] = missing or silence_reason or self.unwatched.get(name, "")
+        self.unwatched = reasons
+
+    def message(self, name: AlarmName, raised: RaisedAlarm | None, *, cause_cleared: bool) -> AlarmMessage:
+        """Return the changing content of the payload of an alarm."""
+        reasons = self._texts.get(name, ())
+        if name == "sensor_fault":
+            faults = (text for quantity, text in self.input_faults.texts.items() if quantity not in self._lost)
+            board = (self.board,) if self.board else ()
+            reasons = (*(self._loss_text(each) for each in self._lost), *faults, *board, *reasons)
+        return AlarmMessage(
+            raised,
+            cause_cleared=cause_cleared,
+            reasons=reasons,
+            unwatched_reason=self.unwatched.get(name),
+            unknown_reason=self.unknown.get(name),
+        )
+
+    @property
+    def _loss_texts(self) -> Mapping[FaultyInput, str]:
+        return LOSS_TEXTS | dict(self.input_faults.texts)
+
+    def _loss_text(self, quantity: Quantity) -> str:
+        """Describe a lost quantity and the unwatched alarms that need it."""
+        names = ", ".join(name for name in self.unwatched if quantity in ALARM_KINDS[name].needs)
+        text = self._loss_texts[quantity]
+        return f"{text}: {names} cannot be raised" if names else text
+
+
+def suspect_texts(suspects: InputFault, suspicions: Sequence[str]) -> tuple[str, ...]:
+    """Return those of the suspicions that describe ``suspects``. Each ends in the text of its fault."""
+    return tuple(text for text in suspicions for suspect in suspects if text.endswith(suspect.text))
+
+
+def find_unknown(row: np.void, *, soc_known: bool) -> dict[AlarmName, str]:
+    """Return the alarms whose value is not known although the quantities that they need are measured, each with the reason.
+
+    A fuel cell has no such alarm, because it has no SOC. The probability of ``collapse_risk`` includes the uncertainty of the SOC.
+
+    Args:
+        row: The last estimate, dtype TRACE.
+        soc_known: True if its SOC is known.
+    """
+    if math.isnan(row["soc"]):
+        return {}
+    reasons: dict[AlarmName, str | None] = {
+        "soc_low": None if soc_known else UNKNOWN_SOC,
+        "stability_margin_low": missing_margin_reason(row, soc_known=soc_known),
+    }
+    return {name: reason for name, reason in reasons.items() if reason}
+
+
+def time_left_text(forecast: np.void) -> str:
+    """Return a sentence with the 90 % band of the time to the cut-off, from a record of FORECAST."""
+    early_min, late_min = (float(forecast[f"time_to_cutoff_{name}_s"]) / 60.0 for name in ("p05", "p95"))
+    return f"the time left was {early_min:.0f} to {late_min:.0f} min (90 % band) when the alarm was raised"
