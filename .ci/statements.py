@@ -5,11 +5,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-<<<<<<< HEAD
-LIMITS = {"bms_estimator": 46_660, "tests": 49_700}
-=======
-LIMITS = {"bms_estimator": 46_791, "tests": 49_320}
->>>>>>> owner
+LIMITS = {"bms_estimator": 46_700, "tests": 49_700}
 
 
 def is_text(node: ast.stmt) -> bool:
