@@ -20,10 +20,10 @@ PROMETHEUS_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-prometh
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # Programs that the tests run: compiler and simulator of the board, a broker, systemd's checks.
-APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium libfaketime qemu-user
 
 .DEFAULT_GOAL := help
-.PHONY: help venv apt audit check deb addon docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month electrochemical bank cells power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema compile-order notebook lock
+.PHONY: help venv apt audit check deb deb-arm64 addon docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month electrochemical bank cells power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema compile-order notebook lock
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / {printf "make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -165,6 +165,10 @@ integrations: apt venv prometheus ## tests with the real Node-RED, AsyncAPI pars
 
 deb: venv ## the Debian package in build/deb, with the program and the packages that it requires: three minutes
 	@$(BIN)/python deploy/debian/build.py build/deb
+
+deb-arm64: venv ## the Debian package for arm64 in build/deb-arm64, on any machine: ten minutes
+	@.ci/apt mmdebstrap proot qemu-user qemu-user-static
+	@$(BIN)/python deploy/debian/build.py build/deb-arm64 --arm64
 
 addon: venv ## a repository with the Home Assistant add-on in build/addon, for a Git server or the folder /addons
 	rm -rf build/addon && mkdir -p build/addon && cp deploy/home-assistant/repository.yaml build/addon

@@ -1,12 +1,14 @@
-"""Build the Debian package of the program: ``make deb``.
+"""Build the Debian package of the program: ``make deb``, and ``make deb-arm64`` for arm64 on any machine.
 
 The package has a virtual environment in /usr/lib/bms-estimator with the wheel of this checkout and the packages that it
-requires. They are copied from the environment of this script, which is installed from requirements.lock with its hashes.
-It contains the compiled kernels, for the minor version of Python and the architecture of the machine that builds it.
+requires. They are copied from the environment of this script, which is installed from requirements.lock with its hashes, or
+else installed for arm64 with the same versions and hashes.
+It contains the compiled kernels, for the minor version of Python of this script and the architecture of the package.
 The maintainer scripts run ``bms-estimator install`` and ``uninstall``.
 """
 
 import argparse
+import os
 import re
 import shutil
 import subprocess
@@ -15,6 +17,8 @@ import zipfile
 from email.utils import formatdate
 from importlib.metadata import Distribution
 from pathlib import Path
+
+import arm64
 
 from bms_estimator.installation import places
 from bms_estimator.installation.program_copy import (
@@ -35,15 +39,18 @@ EXTRAS = ("calibration", "can", "modbus", "prometheus", "report")
 ENVIRONMENT = Path("/usr/lib/bms-estimator")
 SCRIPTS = Path(__file__).parent / "scripts"
 """Folder with the maintainer scripts."""
+LOCKED = re.compile(r"(?m)^([\w.-]+)==([^\s;\\]+).*\n(?: .*\n)*")
+"""Lines of a package in requirements.lock."""
 MAINTAINER = "bms_estimator <bms-estimator@localhost>"
 
 
-def build(output: Path, compression: str) -> Path:
+def build(output: Path, compression: str, architecture: str) -> Path:
     """Build the package in a new folder ``output``. Return the path of the package.
 
     Args:
         output: Folder for the package and its parts; an earlier one is replaced.
         compression: Compression of the package, as for ``dpkg-deb -Z``.
+        architecture: Debian's name of the package's architecture: that of this machine, or arm64.
     """
     shutil.rmtree(output, ignore_errors=True)
     root = output / "root"
@@ -54,34 +61,47 @@ def build(output: Path, compression: str) -> Path:
         wheel.extractall(site_packages)
     program = Distribution.at(next(site_packages.glob(f"{DISTRIBUTION}-*.dist-info")))
     packages = required_packages(program, EXTRAS)
-    require_locked(packages)
-    copy_packages(packages, site_packages)
-    copy_kernels(site_packages)
+    locked = locked_packages(packages)
+    if architecture == own_architecture():
+        copy_packages(packages, site_packages)
+        compile_kernels()
+        copy_kernels(kernel_folder(), os.uname().machine, site_packages)
+    else:
+        arm64.install_packages(locked, site_packages)
+        cache, digest = kernel_folder().parent, kernel_folder().name
+        cache = cache.with_name(f"{cache.name}-{arm64.MACHINE}")
+        subprocess.run([sys.executable, arm64.__file__], env=os.environ | {"NUMBA_CACHE_DIR": str(cache)}, check=True)
+        copy_kernels(cache / digest, arm64.MACHINE, site_packages)
     for folder in list(site_packages.rglob("__pycache__")):  # postinst compiles the files on the machine
         shutil.rmtree(folder)
     link = root / "usr/bin/bms-estimator"
     link.parent.mkdir()
     link.symlink_to(f"..{ENVIRONMENT.as_posix().removeprefix('/usr')}/bin/bms-estimator")
     write_documents(root / "usr/share/doc/bms-estimator", program.version)
-    write_control(root / "DEBIAN", program.version, size_kib(root))
+    write_control(root / "DEBIAN", program.version, architecture, size_kib(root))
     subprocess.run(["chmod", "-R", "u=rwX,go=rX", root], check=True)
     for library in site_packages.rglob("*.so*"):  # libraries of a Debian package are not executable
         library.chmod(0o644)
-    package = output / f"bms-estimator_{program.version}_{architecture()}.deb"
+    package = output / f"bms-estimator_{program.version}_{architecture}.deb"
     subprocess.run(["dpkg-deb", "--root-owner-group", f"-Z{compression}", "--build", root, package], check=True)
     return package
 
 
-def copy_kernels(site_packages: Path) -> None:
-    """Copy the compiled kernels to the package, so that no machine compiles them. Compile those that are missing."""
-    compile_kernels()
+def kernel_folder() -> Path:
+    """Return the folder of the kernels that this machine compiles."""
     if CACHE_FOLDER is None:
         sys.exit("no folder for compiled kernels can be written: set NUMBA_CACHE_DIR=FOLDER")
+    return CACHE_FOLDER
+
+
+def copy_kernels(folder: Path, machine: str, site_packages: Path) -> None:
+    """Copy the compiled kernels in ``folder`` to the package, so that no machine compiles them."""
+    target = site_packages / PACKAGE.name / "compiled" / folder.name
     version = f"py{sys.version_info.major}{sys.version_info.minor}"
-    for file in (CACHE_FOLDER / COMPLETE_FILE, *CACHE_FOLDER.rglob(f"*.{version}.*.nbc")):
-        target = site_packages / PACKAGE.name / "compiled" / file.relative_to(CACHE_FOLDER.parent)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, target)
+    for file in folder.rglob(f"*.{version}.*.nbc"):
+        (target / file.relative_to(folder)).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, target / file.relative_to(folder))
+    (target / COMPLETE_FILE.replace(os.uname().machine, machine)).touch()
 
 
 def build_wheel(output: Path) -> Path:
@@ -91,13 +111,14 @@ def build_wheel(output: Path) -> Path:
     return next(output.glob("*.whl"))
 
 
-def require_locked(packages: list[Distribution]) -> None:
-    """End with an error if an installed package has another version than in requirements.lock."""
+def locked_packages(packages: list[Distribution]) -> str:
+    """Return the lines of requirements.lock for packages. End with an error if an installed one has another version."""
     lock = (PROJECT / "requirements.lock").read_text(encoding="utf-8")
-    locked = {(normalize(name), version) for name, version in re.findall(r"(?m)^([\w.-]+)==([^\s;\\]+)", lock)}
+    lines = {(normalize(line[1]), line[2]): line[0] for line in LOCKED.finditer(lock)}
     for package in packages:
-        if (normalize(package.name), package.version) not in locked:
+        if (normalize(package.name), package.version) not in lines:
             sys.exit(f"{package.name} {package.version} is not the version of requirements.lock: make venv")
+    return "".join(lines[normalize(package.name), package.version] for package in packages)
 
 
 def normalize(name: str) -> str:
@@ -105,7 +126,7 @@ def normalize(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def architecture() -> str:
+def own_architecture() -> str:
     """Return Debian's name of this machine's architecture."""
     return subprocess.run(["dpkg", "--print-architecture"], capture_output=True, text=True, check=True).stdout.strip()
 
@@ -127,7 +148,7 @@ def write_documents(folder: Path, version: str) -> None:
     (folder / "changelog.gz").write_bytes(compressed)
 
 
-def write_control(folder: Path, version: str, installed_kib: int) -> None:
+def write_control(folder: Path, version: str, architecture: str, installed_kib: int) -> None:
     """Write the package's description and its maintainer scripts."""
     folder.mkdir()
     minor = sys.version_info.minor
@@ -135,7 +156,7 @@ def write_control(folder: Path, version: str, installed_kib: int) -> None:
         f"""\
 Package: bms-estimator
 Version: {version}
-Architecture: {architecture()}
+Architecture: {architecture}
 Maintainer: {MAINTAINER}
 Installed-Size: {installed_kib}
 Depends: {PYTHON}, python3 (>= 3.{minor}), python3 (<< 3.{minor + 1}~), libc6, libstdc++6, passwd, systemd, udev
@@ -161,5 +182,7 @@ if __name__ == "__main__":
     parser.add_argument(
         "--compression", default="xz", help="compression of the package, as for dpkg-deb -Z; default: xz"
     )
+    parser.add_argument("--arm64", action="store_true", help="build for arm64 on another machine")
     arguments = parser.parse_args()
-    sys.stdout.write(f"{build(arguments.output, arguments.compression)}\n")
+    target = "arm64" if arguments.arm64 else own_architecture()
+    sys.stdout.write(f"{build(arguments.output, arguments.compression, target)}\n")
