@@ -253,8 +253,7 @@ class PartitionLease:
             async with self._state_lock:
                 partition = await self._take_over()
             self._delivered.pin = delivered.pin
-        # all guarded messages at once: reading a single one from the stream takes as long as reading a thousand
-        await self._catch_up(partition, max(delivered.sequence, self._guard.end_sequence))
+        await self._catch_up(partition, delivered.sequence)
         self._delivered.is_caught_up = True
 
     async def _read_undelivered(self) -> None:

@@ -32,14 +32,11 @@ class ReplayGuard:
     Args:
         records: Records of the replays.
         partition: Number of the partition.
-
-    Attributes:
-        end_sequence: Stream sequence number of the last guarded message; 0: none.
     """
 
     def __init__(self, records: ReplayRecords, partition: int) -> None:
         self._records, self._partition = records, partition
-        self.end_sequence = 0
+        self._end_sequence = 0
         self._deaths: dict[int, int] = {}
 
     async def begin(self, claim: Claim, end_sequence: int) -> None:
@@ -52,7 +49,7 @@ class ReplayGuard:
         Raises:
             nats.errors.Error: The server does not respond.
         """
-        self.end_sequence = 0
+        self._end_sequence = 0
         if claim.pointer.unsaved_claims < GUARDED_CLAIMS:
             return
         record = await self._records.read(self._partition)
@@ -60,11 +57,11 @@ class ReplayGuard:
         if record.sequence:
             deaths[record.sequence] = deaths.get(record.sequence, 0) + 1
         self._deaths = {sequence: deaths[sequence] for sequence in sorted(deaths)[-MAX_SUSPECTS:]}
-        self.end_sequence = end_sequence
+        self._end_sequence = end_sequence
 
     def is_guarded(self, sequence: int) -> bool:
         """Return True if a block belongs to the guarded replay."""
-        return sequence <= self.end_sequence
+        return sequence <= self._end_sequence
 
     async def is_lethal(self, sequence: int) -> bool:
         """Return True if a block is lethal; otherwise store on the server that it is being processed.

@@ -1,25 +1,21 @@
 """Partition lease that gets no deliveries: after the death of another worker, another owner, or an internal error."""
 
 import asyncio
-from collections.abc import AsyncGenerator
 from pathlib import Path
 
 import nats
-import pytest
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
-from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer, RawMessages
+from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.table_in_force import PackLookup
-from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS
 from bms_estimator.fleet.worker.worker import Options, work
 from bms_estimator.process.tasks import end, until_first_ends
 from tests.fleet.nats_cluster import running
@@ -79,26 +75,6 @@ async def test_block_with_an_internal_error_is_skipped_and_counted_as_a_fault(tm
         assert lease.runner.faults == 1
         assert lease.partition
         assert lease.partition.counters["blocks"] == len(PACKS) - 1
-        await end(running_lease)
-        await nc.close()
-
-
-async def test_guarded_replay_is_read_from_the_stream_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads, read = list[tuple[int, int]](), RawMessages.read
-
-    def counted_read(messages: RawMessages, first: int, last: int) -> AsyncGenerator[tuple[str, StoredMessage], None]:
-        reads.append((first, last))
-        return read(messages, first, last)
-
-    monkeypatch.setattr(RawMessages, "read", counted_read)
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await nats.connect(cluster.url)
-        await make_streams(nc, partitions=1)
-        former_owners = await open_checkpoints(nc, "former")
-        for _ in range(GUARDED_CLAIMS + 1):
-            await former_owners.claim(0)
-        _, running_lease = await _lease_after_first_blocks(nc, await load_packs(nc, PACKS))
-        assert reads == [(1, len(PACKS))]
         await end(running_lease)
         await nc.close()
 
