@@ -246,6 +246,8 @@ class CellModel(Strict):
     fit: Fit | None = Field(default=None, repr=False, description="captures that the values were fitted to")
     no_forecast_reason: ClassVar[str] = "the identifier is switched off"
     """Reason why the estimator of this model makes no forecasts, if it makes none."""
+    always_learns: ClassVar[bool] = False
+    """False: the observer uses the configured law."""
 
     @model_validator(mode="after")
     def _known_parameters(self) -> Self:

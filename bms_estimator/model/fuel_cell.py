@@ -83,6 +83,8 @@ class FuelCellModel(Strict):
 
     no_forecast_reason: ClassVar[str] = "a fuel cell has no state of charge"
     """Reason why the estimator of this model makes no forecasts."""
+    always_learns: ClassVar[bool] = True
+    """True: the observer uses the law ``learning``, whatever is configured."""
 
     @property
     def capacity_ah(self) -> None:

@@ -325,7 +325,7 @@ def assemble(
     if has_load and estimator.identifying and isinstance(model, CellModel):
         cutoff_v = load_cutoff_v(settings, model)
         forecaster = Forecaster(estimator, cutoff_v=cutoff_v, limits=power_limits(settings, model))
-    device_soc_std = settings.pack.device_soc_std if estimator.identifying and isinstance(model, CellModel) else None
+    device_soc_std = settings.pack.device_soc_std if estimator.identifying else None
     return Pack(
         estimator,
         slow_fit,

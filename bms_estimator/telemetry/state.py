@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from bms_estimator.forecast.forecast import FORECAST, Forecast, unknown_values
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.estimate import Estimate
@@ -269,7 +268,7 @@ def make_info_payload(
         started_s: Wall clock at start [s since 1970].
         temperature_sensor: True if the cell temperature is measured.
     """
-    learns = settings.observer.law == "learning" or not isinstance(pack, CellModel)  # a fuel cell always learns
+    learns = settings.observer.law == "learning" or pack.always_learns
     return Info(
         device=settings.pack.name,
         version=__version__,

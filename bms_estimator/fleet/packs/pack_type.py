@@ -194,7 +194,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], adv
         alarms=AlarmDefinitions.of(alarms, settings, cell, float(estimator.settings["gap_s"][0])),
         short_limit_a=short_limit_a(settings, cell),
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
-        capacity_ah=cell.cell.capacity_ah if isinstance(cell, CellModel) else None,
+        capacity_ah=cell.capacity_ah,
         cutoff_v=load_cutoff_v(settings, cell) if isinstance(cell, CellModel) else math.nan,
         filter_bytes=estimator.settings_record["filter"].view(np.uint8),
         cell_file_bytes=bytes_of(estimator.cell_file_settings),

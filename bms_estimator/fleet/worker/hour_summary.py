@@ -19,7 +19,6 @@ from bms_estimator.kernels.accumulators.hour import HOUR_SUMS, HOURLY_FIELDS, ac
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
-from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.settings.pack import PackSettings
 
 __all__ = ["HOUR_S", "HOUR_SUMS", "Hour", "add", "begin", "hour_of", "row"]
@@ -111,12 +110,13 @@ def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour
         estimator: Estimator with the pack's state at the hour's end; read only.
     """
     h, record = sums[0], estimator.record[0]
-    capacity_ah = None if isinstance(estimator.cell, FuelCellModel) else float(estimator.cell.cell.capacity_ah)
     unknown = dict.fromkeys(Hour.model_fields)
     values = unknown | _counts(h, record) | _measurements(h) | _observer_values(record) | _filter_values(estimator)
     identity = {"pack": pack.name, "cell": pack.cell, "series": pack.series, "parallel": pack.parallel}
     return Hour.model_validate(
-        {name: _finite(value) for name, value in values.items()} | identity | {"hour": hour, "capacity_ah": capacity_ah}
+        {name: _finite(value) for name, value in values.items()}
+        | identity
+        | {"hour": hour, "capacity_ah": estimator.cell.capacity_ah}
     )
 
 
