@@ -136,5 +136,7 @@ def test_a_noisy_voltage_of_a_parked_pack_is_no_frozen_current(current_a: float,
     samples, _ = simulate_file(load_cell("nmc", PARKED_AH), np.r_[driven_a, np.full(6 * HOUR, current_a)], 0.8)
     samples = samples[::step_s]
     samples["voltage_v"] += np.random.default_rng(1).normal(0.0, 0.013, samples.size)
-    _, _, suspects = run(Estimator(load_cell("nmc", PARKED_AH), initial_soc=0.8, sampling=Sampling(float(step_s))), samples)
+    _, _, suspects = run(
+        Estimator(load_cell("nmc", PARKED_AH), initial_soc=0.8, sampling=Sampling(float(step_s))), samples
+    )
     assert not (suspects & FROZEN_FAULTS).any()
