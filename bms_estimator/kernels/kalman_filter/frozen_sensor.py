@@ -24,9 +24,6 @@ SWING_V = 0.02
 NOISE_STEPS = 4.0
 """Minimum change of the voltage for the proof that a constant current is frozen, in multiples of the mean change between two samples.
 The voltage follows a load for longer than one sample, so that its mean change is small. Noise changes it at each sample."""
-SPARSE_NOISE_STEPS = 7.0
-"""The same at ``FAST_S`` between samples, at which the change is a difference of three samples, each with the noise. With
-``NOISE_STEPS``, a parked pack with noise of 3 mV would have the fault for 96 % of a month."""
 MIN_RESOLUTION_STEPS = 3.0
 """Minimum change of the voltage for a proof, in multiples of its resolution."""
 OCV_CHANGE_V = 0.01
@@ -82,11 +79,10 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
 @njit(cache=True)
 def voltage_has_swung(c: Record, p: Record, counted_s: float, voltage_v: float, resolved_v: float) -> bool:
     """Return True if a voltage change under a constant current exceeds the noise, and update the mean change."""
-    averaged_s = min(max(c.same_s, counted_s), OUTLIERS_S)  # the time of the constant current
-    c.noise_v += counted_s / averaged_s * (abs(voltage_v - c.last_v) - c.noise_v)
-    return abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > max(
-        SWING_V * p.series, resolved_v, c.noise_v * max(NOISE_STEPS, SPARSE_NOISE_STEPS * counted_s / FAST_S)
-    )
+    share = counted_s / min(max(c.same_s, counted_s), OUTLIERS_S)  # a mean over the time of the constant current
+    c.noise_v += share * (abs(voltage_v - c.last_v) - c.noise_v)
+    limit_v = max(SWING_V * p.series, resolved_v, NOISE_STEPS * c.noise_v)
+    return abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > limit_v
 
 
 @njit(cache=True)
