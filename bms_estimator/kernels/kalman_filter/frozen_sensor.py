@@ -25,10 +25,7 @@ SWING_V = 0.02
 """Change of the voltage of one cell that proves a constant current frozen [V]."""
 NOISE_STEPS = 4.0
 """A constant current is frozen only if the voltage changes by more than this multiple of its mean change between two samples. A load
-moves the voltage seldom, noise at each sample."""
-SPARSE_NOISE_STEPS = 7.0
-"""The same at ``FAST_S`` between samples, at which the change is a difference of three samples, each with the noise. With
-``NOISE_STEPS``, a parked pack with noise of 3 mV would have the fault for 96 % of a month."""
+moves the voltage seldom, noise at each sample, so that noise alone never exceeds the limit."""
 MIN_RESOLUTION_STEPS = 3.0
 """Minimum change of the voltage for a proof, in multiples of its resolution."""
 OCV_CHANGE_V = 0.01
@@ -89,9 +86,9 @@ def voltage_has_swung(c: Record, p: Record, counted_s: float, voltage_v: float, 
     """Return True if a voltage change under a constant current exceeds the noise, and update the mean change."""
     share = counted_s / min(max(c.same_s, counted_s), OUTLIERS_S)  # a mean over the time of the constant current
     c.noise_v += share * (abs(voltage_v - c.last_v) - c.noise_v)
-    steps = max(NOISE_STEPS, SPARSE_NOISE_STEPS * counted_s / FAST_S)
+    limit_v = max(SWING_V * p.series, resolved_v, NOISE_STEPS * c.noise_v)
     # the second difference is 0 for a steady drift of the voltage
-    return abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > max(SWING_V * p.series, resolved_v, steps * c.noise_v)
+    return abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > limit_v
 
 
 @njit(cache=True)

@@ -128,15 +128,12 @@ def test_a_coarse_voltage_with_a_configured_resolution_is_not_frozen() -> None:
     assert not (suspects & FROZEN_FAULTS).any()
 
 
-@pytest.mark.parametrize("step_s", [5, 10])
 @pytest.mark.parametrize("current_a", [0.0, 0.3], ids=["exactly 0 A", "constant offset"])
-def test_a_noisy_voltage_of_a_parked_pack_is_no_frozen_current(current_a: float, step_s: int) -> None:
+def test_a_noisy_voltage_of_a_parked_pack_is_no_frozen_current(current_a: float) -> None:
     """The converter's noise exceeds the change of the voltage that proves a frozen current. It has no other cause than noise."""
     driven_a = load_a(1200, (0.0, 10.0, 20.0))
     samples, _ = simulate_file(load_cell("nmc", PARKED_AH), np.r_[driven_a, np.full(6 * HOUR, current_a)], 0.8)
-    samples = samples[::step_s]
+    samples = samples[::5]
     samples["voltage_v"] += np.random.default_rng(1).normal(0.0, 0.013, samples.size)
-    _, _, suspects = run(
-        Estimator(load_cell("nmc", PARKED_AH), initial_soc=0.8, sampling=Sampling(float(step_s))), samples
-    )
+    _, _, suspects = run(Estimator(load_cell("nmc", PARKED_AH), initial_soc=0.8, sampling=Sampling(5.0)), samples)
     assert not (suspects & FROZEN_FAULTS).any()
