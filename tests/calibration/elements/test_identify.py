@@ -403,7 +403,7 @@ def convert_time_to_hours(samples):
         (
             capture(steps()),
             load_cell("thunder_power_6s"),
-            ["lie within the cell's limits", "calibrate, report, validate: --series"],
+            ["lie within the cell's limits", "--series of calibrate, report and validate"],
         ),
     ],
     ids=[
