@@ -35,7 +35,9 @@ def backup(pack: Pack, file: Archive) -> None:
     settings = load_settings(pack)
     with _state_files(pack, settings) as (folder, files):
         if not files:
-            raise UserError(f"{folder}: has no state of the pack {settings.pack.name}; is the user the right one?")
+            raise UserError(
+                f"{folder}: has no state of the pack {settings.pack.name}; run this command as the user that runs its service"
+            )
         content = io.BytesIO()
         with tarfile.open(fileobj=content, mode="w:gz") as archive:
             archive.add(pack, f"{SETTINGS}/{pack.name}")
@@ -43,7 +45,7 @@ def backup(pack: Pack, file: Archive) -> None:
                 archive.add(named, f"{SETTINGS}/{named.name}")
             for each in files:
                 archive.add(each, f"{STATE}/{each.name}", recursive=False)
-    with _reported(file):
+    with _user_errors(file):
         write_private(file, content.getvalue())
     typer.echo(f"{file}: {len(files)} files of the state of {settings.pack.name}, and its settings")
 
@@ -55,22 +57,24 @@ def restore(file: Archive, pack: Pack) -> None:
     A state that exists already is not replaced.
     """
     # decompressed whole, because tarfile does not check the checksum at the end
-    with _reported(file), tarfile.open(fileobj=io.BytesIO(gzip.decompress(file.read_bytes()))) as archive:
+    with _user_errors(file), tarfile.open(fileobj=io.BytesIO(gzip.decompress(file.read_bytes()))) as archive:
         contents = {member.name: _read(archive, member) for member in archive.getmembers() if member.isfile()}
     saved = {name.removeprefix(f"{STATE}/"): data for name, data in contents.items() if name.startswith(f"{STATE}/")}
     files = {Path(name).name: data for name, data in contents.items() if name.startswith(f"{SETTINGS}/")}
     if not saved or not files:
         raise UserError(f"{file}: is not an archive of bms-estimator backup")
-    with _reported(file):
-        text = next(iter(files.values())).decode()  # backup adds the settings file first
+    with _user_errors(file):
+        text = files.pop(next(iter(files))).decode()  # backup adds the settings file first
     archived = parse_toml(text, Settings, str(file))
     settings = load_settings(pack) if pack.exists() else archived
     if settings.pack.name != archived.pack.name:
-        raise UserError(f"{file}: is of the pack {archived.pack.name}, and {pack} is {settings.pack.name}")
+        raise UserError(
+            f"{file}: archive of the pack {archived.pack.name}, but {pack} has pack.name = {settings.pack.name}"
+        )
     with _state_files(pack, settings) as (folder, existing):
         if existing:
             raise UserError(f"{existing[0]}: the pack has a state already; move it away to restore that of {file}")
-        with _reported(folder):
+        with _user_errors(folder):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             for name, data in saved.items():
                 if not _pattern(settings.pack.name).fullmatch(name):
@@ -92,7 +96,7 @@ def _state_files(pack: Path, settings: Settings) -> Iterator[tuple[Path, list[Pa
     """
     is_installed = pack.resolve().parent == places.SETTINGS and settings.state.folder is None
     folder = (places.STATE if is_installed else state_folder_path(settings)).expanduser()
-    with _reported(folder), instance_lock(folder, settings.pack.name):
+    with _user_errors(folder), instance_lock(folder, settings.pack.name):
         found = folder.iterdir() if folder.is_dir() else iter(())
         pattern = _pattern(settings.pack.name)
         yield folder, sorted(each for each in found if each.is_file() and pattern.fullmatch(each.name))
@@ -112,7 +116,7 @@ def _read(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
 
 
 @contextmanager
-def _reported(path: Path) -> Iterator[None]:
+def _user_errors(path: Path) -> Iterator[None]:
     """Convert an error of a file or an archive to UserError."""
     try:
         yield

@@ -55,7 +55,7 @@ def test_a_pack_moves_to_another_machine_with_its_settings_and_all_that_it_has_l
     asyncio.run(learn(load_settings(pack)))
     alike = state_folder(load_settings(pack)) / "home-12345678.run"  # of another pack
     alike.write_text("{}")
-    soc, archive, moved = saved_soc(load_settings(pack)), tmp_path / "home.tar.gz", tmp_path / "second" / "home.toml"
+    soc, archive, moved = saved_soc(load_settings(pack)), tmp_path / "home.tar.gz", tmp_path / "second" / "house.toml"
     assert run(capsys, "backup", pack, archive)[0] == 0
     assert archive.stat().st_mode & 0o777 == 0o600  # it contains the password
     moved.parent.mkdir()
@@ -63,6 +63,7 @@ def test_a_pack_moves_to_another_machine_with_its_settings_and_all_that_it_has_l
     assert run(capsys, "restore", archive, moved)[0] == 0
     assert moved.read_text() == SETTINGS
     assert moved.with_name("home.password").read_text() == "secret"
+    assert {each.name for each in moved.parent.iterdir()} == {"house.toml", "home.password", "state"}
     assert saved_soc(load_settings(moved)) == soc
     names = {each.name for each in (moved.parent / "state/bms-estimator").iterdir()}
     assert names == {each.name for each in (pack.parent / "state/bms-estimator").iterdir()} - {alike.name}
@@ -81,7 +82,7 @@ def test_a_running_service_and_another_pack_are_refused(pack, tmp_path, capsys):
     assert run(capsys, "backup", pack, archive)[0] == 0
     other = pack.with_name("other.toml")
     other.write_text('[pack]\nname = "other"\n')
-    assert "is of the pack home, and" in run(capsys, "restore", archive, other)[2]
+    assert "archive of the pack home, but" in run(capsys, "restore", archive, other)[2]
 
 
 def test_a_file_that_is_no_archive_is_refused(pack, tmp_path, capsys):
