@@ -119,7 +119,7 @@ def test_cell_may_be_a_file_beside_the_table(write_table, tmp_path):
     assert parsed.packs["house"].spec == PackSpec(cell="own")
     assert parsed.cell_files == {"own": tmp_path / "own.toml"}
     check_models(path, parsed, {"own": (tmp_path / "own.toml").read_text()})
-    with pytest.raises(UserError, match=r"packs\.csv: line 2: own: no cell file of this name was loaded"):
+    with pytest.raises(UserError, match=r"packs\.csv: line 2: own: no cell file of this name was uploaded"):
         check_models(path, parsed, {})
 
 
@@ -215,7 +215,7 @@ def test_packs_with_equal_rows_share_settings_and_model():
         (b'{"cell":"lfp","more":1}', "its row is wrong: more: Extra inputs are not permitted"),
         (b'{"cell":"lfp"}', "lfp is a generic cell: give its capacity"),
         (b'{"cell":"lfp","capacity_ah":1e-300}', ""),  # a valid row: any capacity above 0 is allowed
-        (b'{"cell":"own"}', "own: no cell file of this name was loaded"),
+        (b'{"cell":"own"}', "own: no cell file of this name was uploaded"),
         (b'{"cell":"broken"}', "cell broken: not valid TOML"),
         (b'{"cell":"/etc/passwd"}', "its row is wrong: cell: "),
         (b'{"cell":"pem_30w","capacity_ah":1}', "pem_30w is a fuel cell, which has no capacity"),
