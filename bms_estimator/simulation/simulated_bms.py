@@ -69,6 +69,10 @@ class SimulatedBms(SimulatedMeter):
         """Apply ``fault`` to the next ``responses`` responses that have no fault yet."""
         self._faults.extend([fault] * responses)
 
+    def clear_faults(self) -> None:
+        """Discard the remaining faults."""
+        self._faults.clear()
+
     def message(self, reading: Reading) -> bytes:  # noqa: ARG002 - interface
         """Return no bytes, because a BMS sends nothing unsolicited."""
         return b""
