@@ -25,6 +25,7 @@ from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings, StateSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts
+from bms_estimator.sources import factory
 from bms_estimator.sources.serial.board_check import MAX_PENDING_READS, BoardCheck
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from tests.world import invariants
@@ -668,7 +669,7 @@ class World:
     @contextlib.contextmanager
     def _track_source(self) -> Iterator[None]:
         """Store the service's serial source in ``Process``, so that the checks can read its counters."""
-        original = service.SerialSource
+        original = factory.SerialSource
 
         def make_source(*arguments: Any, **named: Any) -> Any:
             source = original(*arguments, **named)
@@ -679,8 +680,8 @@ class World:
                 )
             return source
 
-        service.SerialSource = make_source
+        factory.SerialSource = make_source
         try:
             yield
         finally:
-            service.SerialSource = original
+            factory.SerialSource = original
