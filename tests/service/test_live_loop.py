@@ -316,29 +316,31 @@ async def test_the_properties_of_a_silent_board_stay_published(later_board: dict
 
 
 class ZeroRecorder:
-    """Handler that counts the commands to set the board's current zero, with a clock that the test sets.
+    """Handler that counts the commands to set the board's current zero, with a clock that advances a second with each sample.
+
+    Between sample and publication, the loop therefore publishes no snapshot without the sample.
 
     Attributes:
         calls: Number of commands.
-        now_s: Time of the clock [s].
+        now_s: Time of the clock without samples [s].
     """
 
     def __init__(self) -> None:
-        self.calls, self.now_s = 0, 0.0
-        self.clock = Clock(monotonic=lambda: self.now_s)
+        self.calls, self.now_s, self._counters = 0, 0.0, {"frames_received": 0}
+        self.clock = Clock(monotonic=lambda: self.now_s + self._counters["frames_received"])
 
     async def __call__(self) -> None:
         self.calls += 1
 
     async def feed(self, run: Run, rows: list[tuple[float, float]]) -> None:
         """Feed one sample a second with these currents and voltages, after the first publication."""
+        self._counters = run.source.counters
         while not run.sink.snapshots:
             self.now_s += 0.1
             await asyncio.sleep(0.01)
         for current_a, voltage_v in rows:
-            self.now_s += 1.0
             snapshots_before = len(run.sink.snapshots)
-            run.source.give((self.now_s, current_a, voltage_v))
+            run.source.give((self.clock.monotonic() + 1.0, current_a, voltage_v))
             await run.sink.until(lambda s: s.estimate is not None, skip=snapshots_before)
 
 
