@@ -50,8 +50,11 @@ class PairedSource:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Counters of the monitor, and those of the BMS with the prefix ``bms_``."""
-        return {**self._monitor.counters, **{f"bms_{name}": count for name, count in self._bms.counters.items()}}
+        """Counters of the monitor, and those of the BMS with the suffix ``_of_bms``.
+
+        Alarms count all ``*_errors`` as lost samples. Those of the BMS lose no sample of the monitor.
+        """
+        return {**self._monitor.counters, **{f"{name}_of_bms": count for name, count in self._bms.counters.items()}}
 
     @property
     def silence_reason(self) -> str | None:
