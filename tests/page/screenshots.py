@@ -8,12 +8,13 @@ import contextlib
 import sys
 import tempfile
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from numpy.typing import NDArray
 from playwright.async_api import Browser, expect
 
 from bms_estimator.model.cell import load_cell
@@ -42,6 +43,8 @@ CELLS, CAPACITY_AH = 16, 280.0
 """Number of cells, and their capacity [Ah]."""
 STEP_S, LIVE_S = 60.0, 600.0
 """Interval of the samples, and duration at the end with a sample each second, which the live curves show [s]."""
+Parts = tuple[NDArray[np.void], NDArray[np.float64], NDArray[np.float64]]
+"""Samples, cell voltages [V], and SOC of the BMS."""
 FULL_V = 3.42
 """Voltage of a cell above which the charger reduces its current [V]."""
 TOP_PX = 500
@@ -70,6 +73,7 @@ class House:
         self.settings = Settings.model_validate(SETTINGS | settings)
         self.pack = new_pack(self.settings, load_cell("lfp", CAPACITY_AH).pack(CELLS, 1))
         self.days, self.hour, self.time_s, self.charger_a = days, hour, 0.0, 0.0
+        self.published_s = 0.0
         self.begin_s = time.time() - 86_400.0 * days
         self.collector = Collector()
 
@@ -78,21 +82,24 @@ class House:
         """Simulate the battery, and serve its page. Yield the URL."""
         page, history = PageSettings(listen=f"127.0.0.1:{free_port()}"), folder / f"{free_port()}.sqlite"
         async with PageSink(Pages(), page, "home", history) as sink:
-            clock = Clock(wall=lambda: self.begin_s + self.time_s, monotonic=lambda: self.time_s)
+            clock = Clock(wall=lambda: self.begin_s + self.published_s, monotonic=lambda: self.published_s)
             publisher = Publisher(
                 self.settings, self.pack, source=ScriptedSource(), sinks=[self.collector, sink], clock=clock
             )
-            while self.time_s < 86_400.0 * self.days - LIVE_S:
-                self.run(publisher, STEP_S)
+            while (rest_s := 86_400.0 * self.days - LIVE_S - self.time_s) > 0.0:
+                minutes = 60 if rest_s > 86_400.0 else 5  # each publication computes a forecast
+                self.publish(publisher, [self.run(STEP_S) for _ in range(minutes)])
             while self.time_s < 86_400.0 * self.days:
-                self.run(publisher, 1.0)
+                minute = self.run(1.0)
+                for parts in zip(*(np.split(part, 60) for part in minute), strict=True):
+                    self.publish(publisher, [parts])
             publisher.publish_last()
-            day = [each for each in self.collector.snapshots if each.estimate][-1440 - int(LIVE_S) :]
+            day = [each for each in self.collector.snapshots if each.estimate][-288 - int(LIVE_S) :]
             await record_history(history, day)
             yield f"http://{page.listen}/"
 
-    def run(self, publisher: Publisher, step_s: float) -> None:
-        """Simulate a minute, and publish its samples."""
+    def run(self, step_s: float) -> Parts:
+        """Simulate a minute. Return its samples, its cell voltages [V], and the SOC of the BMS."""
         count = round(60.0 / step_s)
         history = self.bank.run(
             self.current_a() + 3.0 * self.rng.standard_normal(count) * (self.charger_a < 9.0), step_s
@@ -100,14 +107,15 @@ class House:
         self.charger_a *= 0.7 if history.cell_v.max() > FULL_V else 1.0
         samples, soc = history.samples(self.rng, 2e-3, 0.01), float(self.bank.soc.mean())
         cells_v = np.round(history.cell_v + 5e-4 * self.rng.standard_normal(history.cell_v.shape), 3)
-        device_soc = np.full(count, round(min(soc + 0.04, 1.0), 2))
-        size = 1 if step_s == 1.0 else count  # one publication a minute before the end
-        for i in range(0, count, size):
-            part = slice(i, i + size)
-            self.time_s = float(samples["time_s"][part][-1])
-            received = ReceivedSamples(samples[part], cells_v[part], device_soc=device_soc[part])
-            publisher.add(received, self.pack.run(received.samples, received.cells_v, received.device_soc))
-        self.time_s += step_s
+        self.time_s = float(samples["time_s"][-1]) + step_s
+        return samples, cells_v, np.full(count, round(min(soc + 0.04, 1.0), 2))
+
+    def publish(self, publisher: Publisher, parts: Sequence[Parts]) -> None:
+        """Publish once after consecutive parts."""
+        samples, cells_v, device_soc = (np.concatenate(part) for part in zip(*parts, strict=True))
+        self.published_s = float(samples["time_s"][-1])
+        received = ReceivedSamples(samples, cells_v, device_soc=device_soc)
+        publisher.add(received, self.pack.run(samples, cells_v, device_soc))
 
     def current_a(self) -> float:
         """Return the current of the house [A]: the sun charges it from 8 to 16 h until it is full."""
