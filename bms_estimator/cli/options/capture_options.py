@@ -94,7 +94,7 @@ MappedColumns = Annotated[
         "--map",
         parser=parse_column_map,
         metavar="time=COLUMN,...",
-        help="columns of a table, or entities of a history, that contain time, current, voltage and temperature; "
+        help="columns of a table, or entities of a Home Assistant export, that contain time, current, voltage and temperature; "
         "a unit may follow a name, as in 'time=Time \\[ms]'; sheet=SHEET chooses a sheet of a spreadsheet, and instance=NUMBER one of "
         "several batteries",
         show_default=False,
