@@ -75,7 +75,7 @@ COMMANDS = {
     ),
     "accuracy": LazyCommand(
         "bms_estimator.cli.cell.accuracy:accuracy",
-        "Compute how well the SOC of a pack can be known in its use, and which change helps most.",
+        "Compute how well the SOC of a pack can be known, and which change helps most.",
     ),
     "cell": LazyCommand(
         "bms_estimator.cli.cell.commands:app",
@@ -119,7 +119,7 @@ COMMANDS = {
         "bms_estimator.cli.settings.backup:restore", "Restore settings and learned state of a pack from an archive."
     ),
     "compile": LazyCommand(
-        "bms_estimator.cli.settings.compile:compile_command", "Compile the kernels, so that no later start does."
+        "bms_estimator.cli.settings.compile:compile_command", "Compile the kernels before the first start."
     ),
     "config": LazyCommand("bms_estimator.cli.settings.config:app", "Write, check or show a pack's settings."),
 }

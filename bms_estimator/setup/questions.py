@@ -312,7 +312,7 @@ QUESTIONS = (
         f"voltage of the pack at which its charger stops, which is 100 % [V]; {NO_LIMIT}: that of the cell file",
         _parse_full_voltage,
         lambda answers: _suggest_limit_v(answers, 0),
-        explanation="This is 100 %: see the charger's manual. At a higher value than the charger reaches, 100 % is never reported.",
+        explanation="The SOC is 100 % at this voltage: see the charger's manual. If the charger does not reach it, 100 % is never reported.",
         hint="empty: usual for the chemistry",
     ),
     Question(

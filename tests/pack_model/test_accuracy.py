@@ -17,7 +17,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "theory" / "observability.md"
 CELLS = ("nmc", "nca", "lmo", "lfp", "ncr18650")
 """Generic cells, and the file of one measured cell."""
 LOWEST_SOCS = (0.12, 0.30, 0.50)
-"""Lower ends of the windows of the documented table [SOC]."""
+"""Lower ends of the windows; the documented table has the first and the last [SOC]."""
 SOCS = np.array([0.2, 0.35, 0.5, 0.65, 0.8, 0.9])
 """SOCs of the columns of the documented table."""
 RATED_AH = 3.0
@@ -46,10 +46,10 @@ def documented() -> dict[tuple[str, float, bool], list[str]]:
     }
 
 
-@pytest.mark.parametrize("name", CELLS)
+@pytest.mark.parametrize("name", ["nmc", "lfp", "ncr18650"])
 def test_the_documented_table_has_the_computed_values(name: str) -> None:
     rows, cell = documented(), curves(name)
-    for low in LOWEST_SOCS:
+    for low in (min(LOWEST_SOCS), max(LOWEST_SOCS)):
         for full in (False, True):
             result, expected = Accuracy(cell, Window(low, full=full)), rows[name, low, full]
             stds = [*result.std(SOCS), result.mean_std, result.capacity_std]

@@ -61,16 +61,17 @@ def accuracy(
         tuple[float, float] | None,
         typer.Option(
             metavar="LOW HIGH",
-            help="lowest and highest SOC of the use [%]; HIGH of 100: with full charges; default: those of the history",
+            help="lowest and highest SOC of the use [%]; 100 as HIGH: the pack is fully charged; default: those of the history",
             show_default=False,
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute how well the SOC can be known in a use, and which change of the use or of the equipment helps most.
+    """Compute how well the SOC of a pack can be known, and which change of its use or equipment helps most.
 
-    The result is a lower bound: the std that remains however long the estimator runs, if it knows only the cell
-    file. On average over the cells that the file describes, no estimator has a smaller error. With --cell, a pack without a temperature sensor is assumed.
+    The result is a lower bound: the std that remains however long the estimator runs, if it knows only the cell file.
+    On average over the cells that the file describes, no estimator has a smaller error.
+    With --cell, a pack without a temperature sensor is assumed.
     """
     if pack is None and between is None:
         raise UserError("give --pack pack.toml, or --cell NAME with --between LOW HIGH")

@@ -17,7 +17,7 @@ COLUMNS = ("pack", "stored", "sequence", "bytes", "worker", "reason")
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
-    help="List or replay blocks that workers could not process: undecodable ones, and ones that killed workers.",
+    help="List or replay blocks that workers could not process.",
 )
 
 

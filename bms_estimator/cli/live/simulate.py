@@ -87,7 +87,9 @@ def simulate(
     ] = None,
     password_file: Annotated[
         Path | None,
-        typer.Option(help="with --mqtt mqtt://user@host: file with the password", show_default=False),
+        typer.Option(
+            help="file with the password, if --mqtt has a user without one: mqtt://user@host", show_default=False
+        ),
     ] = None,
     prefix: Annotated[
         str, typer.Option(help="with --mqtt: name of the ESPHome node, and first level of its topics")

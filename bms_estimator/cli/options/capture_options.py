@@ -70,7 +70,7 @@ SignOfCurrent = Annotated[
     typer.Option(
         metavar="SIGN",
         help="direction of positive current in the capture: discharge_positive or charge_positive; default: "
-        "the format's direction; if it defines none, the direction that the voltage shows",
+        "as the file format defines it, otherwise as the voltage shows it",
     ),
 ]
 TemperatureWithoutSensor = Annotated[
@@ -94,8 +94,8 @@ MappedColumns = Annotated[
         "--map",
         parser=parse_column_map,
         metavar="time=COLUMN,...",
-        help="names of the columns of a table, or of the entities of a history, for one or more of time, current, voltage and "
-        "temperature; a unit may follow a name, as in 'time=Time \\[ms]'; sheet=SHEET chooses a sheet of a spreadsheet, and instance=NUMBER one of "
+        help="columns of a table, or entities of a Home Assistant export, that contain time, current, voltage and temperature; "
+        "a unit may follow a name, as in 'time=Time \\[ms]'; sheet=SHEET chooses a sheet of a spreadsheet, and instance=NUMBER one of "
         "several batteries",
         show_default=False,
     ),

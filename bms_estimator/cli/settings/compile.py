@@ -9,7 +9,7 @@ from bms_estimator.service.kernel_compilation import COMPLETE_FILE
 
 
 def compile_command() -> None:
-    """Compile the kernels, so that no later start does.
+    """Compile the kernels before the first start.
 
     They are stored in $NUMBA_CACHE_DIR, or else in your cache folder. The service uses
     /var/cache/bms-estimator. Debian package and Docker images are built with kernels in the folder `compiled` of the program.
