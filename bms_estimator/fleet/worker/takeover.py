@@ -32,11 +32,14 @@ class ReplayGuard:
     Args:
         records: Records of the replays.
         partition: Number of the partition.
+
+    Attributes:
+        end_sequence: Stream sequence number of the last message of the guarded replay; 0 without one.
     """
 
     def __init__(self, records: ReplayRecords, partition: int) -> None:
         self._records, self._partition = records, partition
-        self._end_sequence = 0
+        self.end_sequence = 0
         self._deaths: dict[int, int] = {}
 
     async def begin(self, claim: Claim, end_sequence: int) -> None:
@@ -49,7 +52,7 @@ class ReplayGuard:
         Raises:
             nats.errors.Error: The server does not respond.
         """
-        self._end_sequence = 0
+        self.end_sequence = 0
         if claim.pointer.unsaved_claims < GUARDED_CLAIMS:
             return
         record = await self._records.read(self._partition)
@@ -57,11 +60,11 @@ class ReplayGuard:
         if record.sequence:
             deaths[record.sequence] = deaths.get(record.sequence, 0) + 1
         self._deaths = {sequence: deaths[sequence] for sequence in sorted(deaths)[-MAX_SUSPECTS:]}
-        self._end_sequence = end_sequence
+        self.end_sequence = end_sequence
 
     def is_guarded(self, sequence: int) -> bool:
         """Return True if a block belongs to the guarded replay."""
-        return sequence <= self._end_sequence
+        return sequence <= self.end_sequence
 
     async def is_lethal(self, sequence: int) -> bool:
         """Return True if a block is lethal; otherwise store on the server that it is being processed.

@@ -172,63 +172,56 @@ def test_revision_of_a_row_is_the_sequence_of_the_block_that_finished_it():
     assert message_id.endswith(".9")
 
 
-async def test_arrival_time_is_the_same_whether_a_message_is_delivered_or_read_from_the_stream(tmp_path):
+async def test_arrival_time_is_the_same_whether_a_message_is_delivered_or_read_from_the_stream(nc):
     """Workers read messages in three ways. With different times they could judge a clock at the limit differently."""
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=1)
-        js, messages = nc.jetstream(), 20
-        for number in range(messages):
-            await js.publish(subjects.raw("p1"), b"%d" % number)
-        read = [each.received_s async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
-        subscription = await js.pull_subscribe("p.0.raw.*", durable="test", stream=subjects.RAW_STREAM)
-        delivered = await subscription.fetch(messages)
-        got = [await js.get_msg(subjects.RAW_STREAM, number + 1) for number in range(messages)]
-        assert len(read) == messages
-        assert read == [parse_position(message.reply).received_s for message in delivered]
-        assert read == [int(message.time.timestamp()) for message in got]
-        assert abs(read[-1] - time.time()) < 60.0
-        await nc.close()
+    js, messages = nc.jetstream(), 20
+    for number in range(messages):
+        await js.publish(subjects.raw("p1"), b"%d" % number)
+    read = [each.received_s async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
+    subscription = await js.pull_subscribe("p.0.raw.*", durable="test", stream=subjects.RAW_STREAM)
+    delivered = await subscription.fetch(messages)
+    got = [await js.get_msg(subjects.RAW_STREAM, number + 1) for number in range(messages)]
+    assert len(read) == messages
+    assert read == [parse_position(message.reply).received_s for message in delivered]
+    assert read == [int(message.time.timestamp()) for message in got]
+    assert abs(read[-1] - time.time()) < 60.0
 
 
-async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_hours(tmp_path):
+async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_hours(
+    nc, cluster, heartbeats, tmp_path
+):
     """Send blocks before the worker starts, which it reads from the stream, and after that, which it gets delivered."""
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=1)
-        await load_packs(nc, ["p1", "p2"])
+    await load_packs(nc, ["p1", "p2"])
 
-        stores_s = {"p1": YEAR_2040_S, "p2": int(time.time()) - 86_400}
+    stores_s = {"p1": YEAR_2040_S, "p2": int(time.time()) - 86_400}
 
-        async def send_hour(number):
-            for pack, store_s in stores_s.items():
-                data = encode(Block(store_s * 10**9, number, 1, time.time(), samples_until(3600.0 * number)))
-                await send(nc, pack, data)
+    async def send_hour(number):
+        for pack, store_s in stores_s.items():
+            data = encode(Block(store_s * 10**9, number, 1, time.time(), samples_until(3600.0 * number)))
+            await send(nc, pack, data)
 
-        await send_hour(1)
-        await send_hour(2)
-        worker = Process(tmp_path, cluster.url, "w1")
-        try:
-            async with Heartbeats(nc) as heartbeats:
-                await heartbeats.until(lambda last: "w1" in last and last["w1"].counters.get("blocks") == 4)
-                await send_hour(3)
-                await heartbeats.until(lambda last: last["w1"].counters.get("blocks") == 6)
-                heartbeat = heartbeats.last["w1"]
-            assert (heartbeat.clock_error_count, list(heartbeat.clock_errors)) == (1, ["p1"])
-            assert heartbeat.clock_errors["p1"] == pytest.approx(YEAR_2040_S + 10_800 - time.time(), abs=60.0)
-            assert await worker.end() == 0
-            rows = {}
-            stream = (await nc.jetstream().stream_info(subjects.HOURS_STREAM)).state
-            for sequence in range(1, stream.last_seq + 1):
-                row = Hour.model_validate_json((await nc.jetstream().get_msg(subjects.HOURS_STREAM, sequence)).data)
-                rows.setdefault(row.pack, []).append(row)
-        finally:
-            worker.kill()
-        assert [row.clock_error_s is not None for row in rows["p1"]] == [True, True]
-        assert [row.clock_error_s for row in rows["p2"]] == [None, None]
-        assert [row.revision for row in rows["p1"]] == [3, 5]
-        assert all(abs(row.received_hour - time.time() / 3600) < 2 for row in rows["p1"] + rows["p2"])
-        await nc.close()
+    await send_hour(1)
+    await send_hour(2)
+    worker = Process(tmp_path, cluster.url, "w1")
+    try:
+        await heartbeats.until(lambda last: "w1" in last and last["w1"].counters.get("blocks") == 4)
+        await send_hour(3)
+        await heartbeats.until(lambda last: last["w1"].counters.get("blocks") == 6)
+        heartbeat = heartbeats.last["w1"]
+        assert (heartbeat.clock_error_count, list(heartbeat.clock_errors)) == (1, ["p1"])
+        assert heartbeat.clock_errors["p1"] == pytest.approx(YEAR_2040_S + 10_800 - time.time(), abs=60.0)
+        assert await worker.end() == 0
+        rows = {}
+        stream = (await nc.jetstream().stream_info(subjects.HOURS_STREAM)).state
+        for sequence in range(1, stream.last_seq + 1):
+            row = Hour.model_validate_json((await nc.jetstream().get_msg(subjects.HOURS_STREAM, sequence)).data)
+            rows.setdefault(row.pack, []).append(row)
+    finally:
+        worker.kill()
+    assert [row.clock_error_s is not None for row in rows["p1"]] == [True, True]
+    assert [row.clock_error_s for row in rows["p2"]] == [None, None]
+    assert [row.revision for row in rows["p1"]] == [3, 5]
+    assert all(abs(row.received_hour - time.time() / 3600) < 2 for row in rows["p1"] + rows["p2"])
 
 
 @pytest.mark.thorough
