@@ -1,6 +1,9 @@
-"""Delays before retries."""
+"""Cancellation of tasks, and delays before retries."""
 
-from bms_estimator.process.tasks import FIRST_DELAY_S, MAX_DELAY_S, Backoff
+import asyncio
+from contextlib import suppress
+
+from bms_estimator.process.tasks import FIRST_DELAY_S, MAX_DELAY_S, Backoff, end, until_first_ends
 
 
 def test_delays_double_up_to_the_maximum_and_differ_between_clients() -> None:
@@ -11,3 +14,19 @@ def test_delays_double_up_to_the_maximum_and_differ_between_clients() -> None:
         backoff.reset()
         assert backoff.next_s() <= FIRST_DELAY_S
     assert len({Backoff().next_s() for _ in range(10)}) > 1
+
+
+async def test_task_that_swallows_its_first_cancellation_ends_before_the_task_that_runs_it() -> None:
+    started = asyncio.Event()
+
+    async def swallow() -> None:
+        started.set()
+        with suppress(asyncio.CancelledError):
+            await asyncio.Event().wait()
+        await asyncio.Event().wait()
+
+    running = asyncio.create_task(until_first_ends(swallow()))
+    await started.wait()
+    await end(running)
+    assert running.cancelled()
+    assert asyncio.all_tasks() == {asyncio.current_task()}
