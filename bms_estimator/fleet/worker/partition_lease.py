@@ -239,7 +239,7 @@ class PartitionLease:
         self._delivered.is_caught_up = False
         while not (await self._try(partial(self._process_up_to, delivered)) and self._delivered.is_caught_up):
             await asyncio.sleep(RETRY_S)
-            if not self.consumer.has_pin:
+            if self._delivered.pin_lapsed or not self.consumer.has_pin:
                 return
 
     async def _process_up_to(self, delivered: DeliveredMessage) -> None:
@@ -251,7 +251,7 @@ class PartitionLease:
             self._delivered.pin = delivered.pin
         # all guarded messages at once, because a request for one of them returns the following ones, too
         await self._catch_up(partition, max(delivered.sequence, self._guard.end_sequence))
-        self._delivered.is_caught_up = self.partition is partition
+        self._delivered.is_caught_up = self.partition is partition and partition.sequence >= delivered.sequence
 
     async def _read_undelivered(self) -> None:
         """Bring the state up to the end of the stream after silence, unless another worker is pinned."""
@@ -292,7 +292,7 @@ class PartitionLease:
         return partition
 
     async def _catch_up(self, partition: Partition, sequence: int) -> None:
-        """Process the stream up to a message, or until another worker has claimed the partition.
+        """Process the stream up to a message, or until another worker may have claimed the partition.
 
         Of each pack, only the newest reply and the newest estimates are published.
         """
@@ -301,12 +301,10 @@ class PartitionLease:
         latest: dict[str, BlockResult] = {}
         async with aclosing(self._messages.read(partition.sequence + 1, sequence)) as messages:
             async for pack, message in messages:
-                if self._delivered.pin_lapsed:
-                    await self._check_ownership()
-                if self.partition is not partition:
-                    return
+                if self._delivered.pin_lapsed or self.partition is not partition:
+                    break
                 latest[pack] = merge(latest.get(pack), await self.runner.process(partition, pack, message))
-        for result in latest.values():
+        for result in latest.values() if self.partition is partition else ():
             await self.results.publish(result)
 
     def _process_next_of_stream(self, delivered: DeliveredMessage) -> None:
