@@ -12,7 +12,6 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, decode, encode
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.nats.stream_reader import read_stream
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.fleet.queries.parquet_files import write
 from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S, MAX_BEHIND_S
@@ -22,9 +21,8 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.process.tasks import end
 from tests.command_line import running_program
 from tests.edge.test_edge_process import Board, write_pack_file
-from tests.fleet.nats_cluster import connected, running
 from tests.fleet.partition_stream import STORE_ID_NS, one_block, table
-from tests.fleet.workers import Heartbeats, Process, load_packs, send
+from tests.fleet.workers import Process, load_packs, send
 from tests.patience import LONG_S
 
 STORE_S = STORE_ID_NS // 10**9
@@ -50,8 +48,11 @@ class EdgeWithClock:
         self._error_file = folder / "clock-error"
         self._command = [sys.executable, "-c", RUN_WITH_CLOCK, self._error_file, "edge", settings]
 
-    async def run(self, heartbeats, *errors_s):
-        """Run the edge, with each error [s] until a worker has two more blocks; then shut it down."""
+    async def run(self, heartbeats, nc, *errors_s):
+        """Run the edge, with each error [s] until a worker has two more blocks; then shut it down.
+
+        Return the blocks in the stream by store and number, which the worker has then processed.
+        """
         self._set(errors_s[0])
         async with running_program(*self._command, stdout=asyncio.subprocess.DEVNULL, stderr=None) as process:
             for error_s in errors_s:
@@ -60,6 +61,11 @@ class EdgeWithClock:
                 await heartbeats.until(lambda last, enough=enough: processed(last) >= enough)
             process.send_signal(signal.SIGTERM)
             assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+        stored = [each async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
+        decoded = [decode(each.data) for each in stored]
+        blocks = {(block.store_created_ns, block.number): block for block in decoded}  # some were sent again
+        await heartbeats.until(lambda last: processed(last) == len(blocks))
+        return blocks
 
     def _set(self, error_s):
         new = self._error_file.with_suffix(".new")
@@ -225,35 +231,28 @@ async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_
 
 
 @pytest.mark.thorough
-async def test_edge_whose_clock_steps_back_by_days_loses_no_sample_and_is_not_silent(tmp_path, line):
+async def test_edge_whose_clock_steps_back_by_days_loses_no_sample_and_is_not_silent(
+    nc, cluster, heartbeats, tmp_path, line
+):
     """The clock is 5 days behind, then correct, then 3 days behind, also after restarts: with the store and without it."""
     line.plug()
-    with running(tmp_path, partitions=1) as cluster:
-        board = asyncio.create_task(Board(line).print_lines())
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=1)
-        await load_packs(nc, ["pack"])
-        worker = Process(tmp_path, cluster.url, "w1")
-        edge = EdgeWithClock(tmp_path, write_pack_file(tmp_path, line, cluster.mqtt_port))
-        try:
-            async with Heartbeats(nc) as heartbeats:
-                await edge.run(heartbeats, -5 * DAY_S, 0, -3 * DAY_S)
-                await edge.run(heartbeats, -3 * DAY_S)
-                for file in (tmp_path / "state-home").rglob("pack.edge.sqlite*"):
-                    file.unlink()
-                await edge.run(heartbeats, -3 * DAY_S)
-                stored = [each async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
-                decoded = [decode(each.data) for each in stored]
-                blocks = {(block.store_created_ns, block.number): block for block in decoded}  # some were sent again
-                await heartbeats.until(lambda last: last["w1"].counters["blocks"] == len(blocks))
-            heartbeat = heartbeats.last["w1"]
-            assert await worker.end() == 0
-        finally:
-            worker.kill()
-            await end(board)
-        stored = [each async for batch in read_stream(nc, subjects.HOURS_STREAM, ">") for each in batch]
-        rows = [Hour.model_validate_json(each.data) for each in stored]
-        await nc.close()
+    board = asyncio.create_task(Board(line).print_lines())
+    await load_packs(nc, ["pack"])
+    worker = Process(tmp_path, cluster.url, "w1")
+    edge = EdgeWithClock(tmp_path, write_pack_file(tmp_path, line, cluster.mqtt_port))
+    try:
+        await edge.run(heartbeats, nc, -5 * DAY_S, 0, -3 * DAY_S)
+        await edge.run(heartbeats, nc, -3 * DAY_S)
+        for file in (tmp_path / "state-home").rglob("pack.edge.sqlite*"):
+            file.unlink()
+        blocks = await edge.run(heartbeats, nc, -3 * DAY_S)
+        heartbeat = heartbeats.last["w1"]
+        assert await worker.end() == 0
+    finally:
+        worker.kill()
+        await end(board)
+    stored = [each async for batch in read_stream(nc, subjects.HOURS_STREAM, ">") for each in batch]
+    rows = [Hour.model_validate_json(each.data) for each in stored]
     first_store, last_store = sorted({store for store, _ in blocks})
     assert (last_store - first_store) / 1e9 == pytest.approx(2 * DAY_S, abs=2 * LONG_S)
     lines = np.concatenate([np.round((block.samples["voltage_v"] - 3.0) * 1e4) for _, block in sorted(blocks.items())])
