@@ -86,8 +86,8 @@ async def test_guarded_replay_reads_each_message_from_the_stream_once(nc: Client
     async with _running_lease(nc, registry, REPLAYED_BLOCKS) as lease:
         received = nc.stats["in_msgs"]
         await until(lambda: lease.runner.blocks == blocks, lambda: lease.runner.blocks)
-        # each message is delivered and read, and its record is acknowledged
-        assert nc.stats["in_msgs"] - received < 4 * blocks
+        # each message is delivered and read
+        assert nc.stats["in_msgs"] - received < 3 * blocks
 
 
 async def test_guarded_replay_ends_when_another_worker_claims_the_partition(nc: Client) -> None:
