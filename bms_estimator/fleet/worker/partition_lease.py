@@ -250,8 +250,9 @@ class PartitionLease:
                 partition = await self._take_over()
             self._delivered.pin = delivered.pin
         # all guarded messages at once, because a request for one of them returns the following ones, too
-        await self._catch_up(partition, max(delivered.sequence, self._guard.end_sequence))
-        self._delivered.is_caught_up = self.partition is partition and partition.sequence >= delivered.sequence
+        self._delivered.is_caught_up = await self._catch_up(
+            partition, max(delivered.sequence, self._guard.end_sequence)
+        )
 
     async def _read_undelivered(self) -> None:
         """Bring the state up to the end of the stream after silence, unless another worker is pinned."""
@@ -291,13 +292,13 @@ class PartitionLease:
             partition.deferred.clear()
         return partition
 
-    async def _catch_up(self, partition: Partition, sequence: int) -> None:
-        """Process the stream up to a message, or until another worker may have claimed the partition.
+    async def _catch_up(self, partition: Partition, sequence: int) -> bool:
+        """Process the stream up to a message. Return False if it ended before, because another worker may own the partition.
 
         Of each pack, only the newest reply and the newest estimates are published.
         """
         if partition.sequence >= sequence:
-            return
+            return True
         latest: dict[str, BlockResult] = {}
         async with aclosing(self._messages.read(partition.sequence + 1, sequence)) as messages:
             async for pack, message in messages:
@@ -306,6 +307,7 @@ class PartitionLease:
                 latest[pack] = merge(latest.get(pack), await self.runner.process(partition, pack, message))
         for result in latest.values() if self.partition is partition else ():
             await self.results.publish(result)
+        return self.partition is partition and not self._delivered.pin_lapsed
 
     def _process_next_of_stream(self, delivered: DeliveredMessage) -> None:
         """Process a delivered message whose predecessors are all processed."""
