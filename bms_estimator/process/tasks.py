@@ -47,11 +47,20 @@ CANCEL_INTERVAL_S = 0.1
 
 
 async def end(*tasks: asyncio.Future[Any]) -> None:
-    """Cancel tasks repeatedly until all have ended. They must not contain work that has to be finished."""
+    """Cancel tasks repeatedly until all have ended. They must not contain work that has to be finished.
+
+    A cancellation of the caller takes effect afterwards, because unfinished tasks would run on without an owner.
+    """
+    cancellation: asyncio.CancelledError | None = None
     while unfinished := {task for task in tasks if not task.done()}:
         for task in unfinished:
             task.cancel()
-        await asyncio.wait(unfinished, timeout=CANCEL_INTERVAL_S)
+        try:
+            await asyncio.wait(unfinished, timeout=CANCEL_INTERVAL_S)
+        except asyncio.CancelledError as error:
+            cancellation = error
+    if cancellation:
+        raise cancellation
 
 
 async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:

@@ -33,7 +33,8 @@ class SimulatedEdges:
 
     Attributes:
         last: Argument ``last``, which may be changed.
-        next_number: Number of the block that each edge sends next, shape (packs,).
+        next_number: Number of the block that each edge sends next, shape (packs,). A request for an earlier block lowers it.
+        first_unsent: Lowest number that each edge has never sent, shape (packs,).
         confirmed_below: Number below which workers have confirmed all blocks of each edge, shape (packs,).
         resends: Number of requests to resend.
         sent: Number of blocks sent, with repetitions.
@@ -46,7 +47,7 @@ class SimulatedEdges:
         self._store_offset_s = (fleet.store_created_ns - fleet.begin_ns) / 1e9
         self.next_number: Whole = np.ones(len(fleet.names), dtype=np.int64)
         self.confirmed_below = self.next_number.copy()
-        self._first_unsent = self.next_number.copy()  # lowest number that each edge has never sent
+        self.first_unsent = self.next_number.copy()
         self._requested: Whole = np.zeros(len(fleet.names), dtype=np.int64)
         self._requested_s: Floats = np.full(len(fleet.names), -np.inf)
         self.resends = self.sent = self.repeated = 0
@@ -61,8 +62,8 @@ class SimulatedEdges:
         numbers = self.next_number[packs]
         self.next_number[packs] += 1
         self.sent += packs.size
-        self.repeated += int(np.count_nonzero(numbers < self._first_unsent[packs]))
-        self._first_unsent[packs] = np.maximum(self._first_unsent[packs], self.next_number[packs])
+        self.repeated += int(np.count_nonzero(numbers < self.first_unsent[packs]))
+        self.first_unsent[packs] = np.maximum(self.first_unsent[packs], self.next_number[packs])
         return Due(packs, numbers, ready_s[packs])
 
     def receive_reply(self, pack: str, reply: BlockRequest, now_s: float) -> bool:

@@ -8,7 +8,6 @@ state includes all earlier ones. All other messages need requests to the server,
 import asyncio
 import time
 from collections.abc import Awaitable, Callable
-from typing import Protocol
 
 from bms_estimator.fleet.worker.block_result import ResultPublisher
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
@@ -23,16 +22,6 @@ Attempt = Callable[[Callable[[], Awaitable[None]]], Awaitable[bool]]
 """Function that runs an action, logs an error of the connection or the server, and returns True if the action succeeded."""
 
 
-class BlockQueue(Protocol):
-    """Delivered messages of one partition (``DeliveredMessages``)."""
-
-    def process_next(self) -> bool:
-        """Process the next message, or leave it to the task of the partition. Return True if the next call can process one."""
-
-    async def publish(self) -> None:
-        """Publish the results of the processed messages."""
-
-
 class BlockLoop:
     """Loop of a worker, which serves the partitions in turn.
 
@@ -42,10 +31,10 @@ class BlockLoop:
 
     def __init__(self) -> None:
         self.step_lock = asyncio.Lock()
-        self._ready: dict[BlockQueue, None] = {}  # in the order in which they are served
+        self._ready: dict[DeliveredMessages, None] = {}  # in the order in which they are served
         self._wake_up = asyncio.Event()
 
-    def add(self, queue: BlockQueue) -> None:
+    def add(self, queue: "DeliveredMessages") -> None:
         """Process the messages of a partition in its turn."""
         self._ready.setdefault(queue)
         self._wake_up.set()
@@ -62,9 +51,9 @@ class BlockLoop:
                 await queue.publish()
             await asyncio.sleep(0)
 
-    def _process_slice(self) -> set[BlockQueue]:
+    def _process_slice(self) -> set["DeliveredMessages"]:
         """Process messages for ``SLICE_S``. Return the served partitions."""
-        end_s, served = time.monotonic() + SLICE_S, set[BlockQueue]()
+        end_s, served = time.monotonic() + SLICE_S, set[DeliveredMessages]()
         while self._ready and time.monotonic() < end_s:
             queue = next(iter(self._ready))
             del self._ready[queue]

@@ -10,7 +10,6 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import aclosing
 from functools import partial
-from typing import TYPE_CHECKING
 
 import structlog
 from nats.aio.client import Client
@@ -19,7 +18,7 @@ from nats.aio.msg import Msg
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.worker.block_loop import SILENCE_S, BlockLoop, DeliveredMessages
-from bms_estimator.fleet.worker.block_result import ResultPublisher, merge
+from bms_estimator.fleet.worker.block_result import BlockResult, ResultPublisher, merge
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
@@ -30,9 +29,6 @@ from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedC
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 from bms_estimator.fleet.worker.takeover import ReplayGuard, restore_partition
 from bms_estimator.process.tasks import until_first_ends
-
-if TYPE_CHECKING:
-    from bms_estimator.fleet.worker.block_result import BlockResult
 
 IDLE_SILENCE_S = 5.0 * SILENCE_S
 """Interval between two searches while the stream has no further messages [s]."""
@@ -241,9 +237,9 @@ class PartitionLease:
     async def _process_delivered(self, delivered: DeliveredMessage) -> None:
         """Process the stream up to a delivered message. Return without it if the pin is lost."""
         self._delivered.is_caught_up = False
-        while not await self._try(partial(self._process_up_to, delivered)):
+        while not (await self._try(partial(self._process_up_to, delivered)) and self._delivered.is_caught_up):
             await asyncio.sleep(RETRY_S)
-            if not self.consumer.has_pin:
+            if self._delivered.pin_lapsed or not self.consumer.has_pin:
                 return
 
     async def _process_up_to(self, delivered: DeliveredMessage) -> None:
@@ -253,8 +249,10 @@ class PartitionLease:
             async with self._state_lock:
                 partition = await self._take_over()
             self._delivered.pin = delivered.pin
-        await self._catch_up(partition, delivered.sequence)
-        self._delivered.is_caught_up = True
+        # all guarded messages at once, because a request for one of them returns the following ones, too
+        self._delivered.is_caught_up = await self._catch_up(
+            partition, max(delivered.sequence, self._guard.end_sequence)
+        )
 
     async def _read_undelivered(self) -> None:
         """Bring the state up to the end of the stream after silence, unless another worker is pinned."""
@@ -281,6 +279,8 @@ class PartitionLease:
             self._changes.begin(partition.in_force.rows, replay_end)
             self._deferred.wake_up()
         last_sequence = await self._messages.last_of_all_partitions()
+        if self._guard.end_sequence > last_sequence:  # the replay was of a stream that the server has lost since
+            self._guard.end_sequence = 0
         if partition.sequence > last_sequence:
             log.warning(
                 "the stream ends before the checkpoint, because it was recreated or has lost its end: reading it from its beginning",
@@ -292,16 +292,22 @@ class PartitionLease:
             partition.deferred.clear()
         return partition
 
-    async def _catch_up(self, partition: Partition, sequence: int) -> None:
-        """Process the stream up to a message. Of each pack, only the newest reply and the newest estimates are published."""
+    async def _catch_up(self, partition: Partition, sequence: int) -> bool:
+        """Process the stream up to a message. Return False if it ended before, because another worker may own the partition.
+
+        Of each pack, only the newest reply and the newest estimates are published.
+        """
         if partition.sequence >= sequence:
-            return
+            return True
         latest: dict[str, BlockResult] = {}
         async with aclosing(self._messages.read(partition.sequence + 1, sequence)) as messages:
             async for pack, message in messages:
+                if self._delivered.pin_lapsed or self.partition is not partition:
+                    break
                 latest[pack] = merge(latest.get(pack), await self.runner.process(partition, pack, message))
-        for result in latest.values():
+        for result in latest.values() if self.partition is partition else ():
             await self.results.publish(result)
+        return self.partition is partition and not self._delivered.pin_lapsed
 
     def _process_next_of_stream(self, delivered: DeliveredMessage) -> None:
         """Process a delivered message whose predecessors are all processed."""

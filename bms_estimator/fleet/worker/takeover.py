@@ -2,7 +2,7 @@
 
 A crash or an endless loop in native code gives a worker no chance to report the block. A worker that takes over a partition
 reads the stream from the last checkpoint, and therefore processes the block again. The claim counts the claims since the
-last checkpoint. From the claim number ``GUARDED_CLAIMS`` on, the worker stores the sequence number of each block of the replay on
+last checkpoint. From the claim number ``GUARDED_CLAIMS`` on, the worker sends the sequence number of each block of the replay to
 the server before it processes the block. If the worker dies, the next owner thereby finds the block that was being processed. A
 block that was found ``MAX_DEATHS`` times is lethal, and is skipped.
 """
@@ -32,11 +32,14 @@ class ReplayGuard:
     Args:
         records: Records of the replays.
         partition: Number of the partition.
+
+    Attributes:
+        end_sequence: Stream sequence number of the last message of the guarded replay; 0 without one.
     """
 
     def __init__(self, records: ReplayRecords, partition: int) -> None:
         self._records, self._partition = records, partition
-        self._end_sequence = 0
+        self.end_sequence = 0
         self._deaths: dict[int, int] = {}
 
     async def begin(self, claim: Claim, end_sequence: int) -> None:
@@ -49,7 +52,7 @@ class ReplayGuard:
         Raises:
             nats.errors.Error: The server does not respond.
         """
-        self._end_sequence = 0
+        self.end_sequence = 0
         if claim.pointer.unsaved_claims < GUARDED_CLAIMS:
             return
         record = await self._records.read(self._partition)
@@ -57,14 +60,14 @@ class ReplayGuard:
         if record.sequence:
             deaths[record.sequence] = deaths.get(record.sequence, 0) + 1
         self._deaths = {sequence: deaths[sequence] for sequence in sorted(deaths)[-MAX_SUSPECTS:]}
-        self._end_sequence = end_sequence
+        self.end_sequence = end_sequence
 
     def is_guarded(self, sequence: int) -> bool:
         """Return True if a block belongs to the guarded replay."""
-        return sequence <= self._end_sequence
+        return sequence <= self.end_sequence
 
     async def is_lethal(self, sequence: int) -> bool:
-        """Return True if a block is lethal; otherwise store on the server that it is being processed.
+        """Return True if a block is lethal; otherwise record on the server that it is being processed.
 
         Args:
             sequence: Stream sequence number of the block.
@@ -72,15 +75,13 @@ class ReplayGuard:
         Raises:
             nats.errors.Error: The server does not respond; the block must not be processed.
         """
-        if not self.is_guarded(sequence):
-            return False
-        if self._deaths.get(sequence, 0) >= MAX_DEATHS:
-            return True
-        await self._records.write(self._partition, ReplayRecord(sequence=sequence, deaths=self._deaths))
-        return False
+        is_lethal = self.is_guarded(sequence) and self._deaths.get(sequence, 0) >= MAX_DEATHS
+        if self.is_guarded(sequence) and not is_lethal:
+            await self._records.deliver(self._partition, ReplayRecord(sequence=sequence, deaths=self._deaths))
+        return is_lethal
 
     async def end_block(self, sequence: int) -> None:
-        """Store on the server that a block was processed. The server receives this record before any later one."""
+        """Record on the server that a block was processed. The server receives this record before any later one."""
         if self.is_guarded(sequence):
             await self._records.send(self._partition, ReplayRecord(deaths=self._deaths))
 

@@ -97,45 +97,40 @@ async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_p
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("has_worker", [True, False], ids=["with a worker", "without a worker"])
-async def test_pack_that_is_added_again_after_its_erasure_begins_anew(tmp_path, capsys, has_worker):
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=1)
-        await load_packs(nc, ["p00001", "p00002"])
-        worker = Process(tmp_path, cluster.url, "w1")
-        try:
-            async with Heartbeats(nc) as heartbeats:
-                await send(nc, "p00001", block("p00001", 1))
-                await send(nc, "p00001", b"not a block")
-                await send(nc, "p00002", block("p00002", 1))
-                await heartbeats.until(lambda last: "w1" in last and last["w1"].packs == 2)
-                await heartbeats.until(lambda last: last["w1"].dead_letters == 1)
-                if not has_worker:
-                    assert await worker.end() == 0
-                command = ("fleet", "packs", "remove", "p00001", "--erase", "--server", cluster.url)
-                code, out, err = await asyncio.to_thread(run, capsys, *command)
-                assert (code, err) == (0, "")
-                assert out.startswith("p00001: 2 blocks, 1 dead letter,")
-                if not has_worker:
-                    worker = Process(tmp_path, cluster.url, "w1")
-                heartbeats.clear()
-                await heartbeats.until(lambda last: "w1" in last and last["w1"].packs == 1)
-                assert "p00001" not in heartbeats.last["w1"].model_dump_json()
-                registry = await load_packs(nc, ["p00001"])
-                for number in range(1, BLOCKS):  # the edge sends its stored blocks again, with the former numbers
-                    await nc.jetstream().publish(subjects.raw("p00001"), block("p00001", number))
-                await heartbeats.until(lambda last: last["w1"].packs == 2)
-                await heartbeats.until(lambda last: last["w1"].counters.get("blocks", 0) >= BLOCKS)
+async def test_pack_that_is_added_again_after_its_erasure_begins_anew(
+    nc, cluster, heartbeats, tmp_path, capsys, has_worker
+):
+    await load_packs(nc, ["p00001", "p00002"])
+    worker = Process(tmp_path, cluster.url, "w1")
+    try:
+        await send(nc, "p00001", block("p00001", 1))
+        await send(nc, "p00001", b"not a block")
+        await send(nc, "p00002", block("p00002", 1))
+        await heartbeats.until(lambda last: "w1" in last and last["w1"].packs == 2)
+        await heartbeats.until(lambda last: last["w1"].dead_letters == 1)
+        if not has_worker:
             assert await worker.end() == 0
-        finally:
-            worker.kill()
-        state = (await end_states(nc, registry, 1))[0].state("p00001")
-        assert estimates_of(state["estimator"]) == estimated(registry, "p00001", BLOCKS - 1)
-        hours = (
-            await nc.jetstream().stream_info(subjects.HOURS_STREAM, subjects_filter=subjects.hours("p00001"))
-        ).state
-        assert hours.subjects == {subjects.hours("p00001"): 1}
-        await nc.close()
+        command = ("fleet", "packs", "remove", "p00001", "--erase", "--server", cluster.url)
+        code, out, err = await asyncio.to_thread(run, capsys, *command)
+        assert (code, err) == (0, "")
+        assert out.startswith("p00001: 2 blocks, 1 dead letter,")
+        if not has_worker:
+            worker = Process(tmp_path, cluster.url, "w1")
+        heartbeats.clear()
+        await heartbeats.until(lambda last: "w1" in last and last["w1"].packs == 1)
+        assert "p00001" not in heartbeats.last["w1"].model_dump_json()
+        registry = await load_packs(nc, ["p00001"])
+        for number in range(1, BLOCKS):  # the edge sends its stored blocks again, with the former numbers
+            await nc.jetstream().publish(subjects.raw("p00001"), block("p00001", number))
+        await heartbeats.until(lambda last: last["w1"].packs == 2)
+        await heartbeats.until(lambda last: last["w1"].counters.get("blocks", 0) >= BLOCKS)
+        assert await worker.end() == 0
+    finally:
+        worker.kill()
+    state = (await end_states(nc, registry, 1))[0].state("p00001")
+    assert estimates_of(state["estimator"]) == estimated(registry, "p00001", BLOCKS - 1)
+    hours = (await nc.jetstream().stream_info(subjects.HOURS_STREAM, subjects_filter=subjects.hours("p00001"))).state
+    assert hours.subjects == {subjects.hours("p00001"): 1}
 
 
 def files_with(folder, text):
@@ -143,21 +138,15 @@ def files_with(folder, text):
     return [file for file in folder.rglob("*.blk") if text.encode() in file.read_bytes()]
 
 
-async def test_pack_without_a_worker_is_erased_and_messages_in_other_streams_are_reported(tmp_path, capsys):
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=1)
-        await nc.jetstream().add_stream(name="REJECTED", subjects=["rejected.*.*"])
-        await nc.jetstream().publish("rejected.p00001.damaged", b"damaged")
-        await send(nc, "p00001", block("p00001", 1))
-        command = ("fleet", "packs", "remove", "p00001", "--erase", "--server", cluster.url)
-        code, out, err = await asyncio.to_thread(run, capsys, *command)
-        assert (code, err) == (0, "")
-        assert out.startswith(
-            "p00001: 1 block, 0 dead letters, 0 hourly summaries and the state in 0 checkpoints erased\n"
-        )
-        assert "p00001: remaining messages in the stream REJECTED: 1\n" in out
-        await nc.close()
+async def test_pack_without_a_worker_is_erased_and_messages_in_other_streams_are_reported(nc, cluster, capsys):
+    await nc.jetstream().add_stream(name="REJECTED", subjects=["rejected.*.*"])
+    await nc.jetstream().publish("rejected.p00001.damaged", b"damaged")
+    await send(nc, "p00001", block("p00001", 1))
+    command = ("fleet", "packs", "remove", "p00001", "--erase", "--server", cluster.url)
+    code, out, err = await asyncio.to_thread(run, capsys, *command)
+    assert (code, err) == (0, "")
+    assert out.startswith("p00001: 1 block, 0 dead letters, 0 hourly summaries and the state in 0 checkpoints erased\n")
+    assert "p00001: remaining messages in the stream REJECTED: 1\n" in out
 
 
 @pytest.fixture

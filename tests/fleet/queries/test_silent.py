@@ -1,16 +1,13 @@
 """Packs of which nothing arrives: judged by the server's clock at the arrival of rows, and by the table of packs."""
 
-import nats
 import pytest
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import remove_keys, write_bucket
 from bms_estimator.fleet.queries.collector import Collector
 from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.fleet.queries.parquet_files import read_packs, write, write_packs
 from tests.fleet.hour_rows import BEGIN, make_hour
-from tests.fleet.nats_cluster import running
 from tests.fleet.queries.test_collector import running_collector
 from tests.patience import until
 
@@ -61,18 +58,15 @@ def test_pack_of_the_table_that_never_sent_is_named_and_a_removed_one_is_not(tmp
     assert silent(tmp_path) == {"never": None}
 
 
-async def test_collector_stores_the_packs_of_the_table(tmp_path, monkeypatch):
+async def test_collector_stores_the_packs_of_the_table(nc, tmp_path, monkeypatch):
     monkeypatch.setattr("bms_estimator.fleet.queries.collector.TABLE_S", 0.0)
-    with running(tmp_path, partitions=1) as cluster:
-        async with await nats.connect(cluster.url) as nc:
-            await make_streams(nc, partitions=1)
-            await write_bucket(nc, subjects.PACKS_BUCKET, {"a": b"{}", "b": b"{}"})
-            write_packs(tmp_path, {"a": 7})
-            async with running_collector(Collector(nc, tmp_path)):
-                await until(lambda: "b" in read_packs(tmp_path))
-                assert read_packs(tmp_path)["a"] == 7  # since when a pack is in the table survives a restart
-                await remove_keys(nc, subjects.PACKS_BUCKET, ["b"])
-                await until(lambda: read_packs(tmp_path) == {"a": 7})
+    await write_bucket(nc, subjects.PACKS_BUCKET, {"a": b"{}", "b": b"{}"})
+    write_packs(tmp_path, {"a": 7})
+    async with running_collector(Collector(nc, tmp_path)):
+        await until(lambda: "b" in read_packs(tmp_path))
+        assert read_packs(tmp_path)["a"] == 7  # since when a pack is in the table survives a restart
+        await remove_keys(nc, subjects.PACKS_BUCKET, ["b"])
+        await until(lambda: read_packs(tmp_path) == {"a": 7})
 
 
 @pytest.mark.parametrize("behind_h", [0, 400 * 24], ids=["valid", "quarantined"])

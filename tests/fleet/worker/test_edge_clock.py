@@ -12,7 +12,6 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, decode, encode
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.nats.stream_reader import read_stream
-from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.fleet.queries.parquet_files import write
 from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S, MAX_BEHIND_S
@@ -22,9 +21,8 @@ from bms_estimator.model.sample import SAMPLE
 from bms_estimator.process.tasks import end
 from tests.command_line import running_program
 from tests.edge.test_edge_process import Board, write_pack_file
-from tests.fleet.nats_cluster import connected, running
 from tests.fleet.partition_stream import STORE_ID_NS, one_block, table
-from tests.fleet.workers import Heartbeats, Process, load_packs, send
+from tests.fleet.workers import Process, load_packs, send
 from tests.patience import LONG_S
 
 STORE_S = STORE_ID_NS // 10**9
@@ -50,8 +48,11 @@ class EdgeWithClock:
         self._error_file = folder / "clock-error"
         self._command = [sys.executable, "-c", RUN_WITH_CLOCK, self._error_file, "edge", settings]
 
-    async def run(self, heartbeats, *errors_s):
-        """Run the edge, with each error [s] until a worker has two more blocks; then shut it down."""
+    async def run(self, heartbeats, nc, *errors_s):
+        """Run the edge, with each error [s] until a worker has two more blocks; then shut it down.
+
+        Return the blocks in the stream by store and number, which the worker has then processed.
+        """
         self._set(errors_s[0])
         async with running_program(*self._command, stdout=asyncio.subprocess.DEVNULL, stderr=None) as process:
             for error_s in errors_s:
@@ -60,6 +61,11 @@ class EdgeWithClock:
                 await heartbeats.until(lambda last, enough=enough: processed(last) >= enough)
             process.send_signal(signal.SIGTERM)
             assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+        stored = [each async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
+        decoded = [decode(each.data) for each in stored]
+        blocks = {(block.store_created_ns, block.number): block for block in decoded}  # some were sent again
+        await heartbeats.until(lambda last: processed(last) == len(blocks))
+        return blocks
 
     def _set(self, error_s):
         new = self._error_file.with_suffix(".new")
@@ -172,95 +178,81 @@ def test_revision_of_a_row_is_the_sequence_of_the_block_that_finished_it():
     assert message_id.endswith(".9")
 
 
-async def test_arrival_time_is_the_same_whether_a_message_is_delivered_or_read_from_the_stream(tmp_path):
+async def test_arrival_time_is_the_same_whether_a_message_is_delivered_or_read_from_the_stream(nc):
     """Workers read messages in three ways. With different times they could judge a clock at the limit differently."""
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=1)
-        js, messages = nc.jetstream(), 20
-        for number in range(messages):
-            await js.publish(subjects.raw("p1"), b"%d" % number)
-        read = [each.received_s async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
-        subscription = await js.pull_subscribe("p.0.raw.*", durable="test", stream=subjects.RAW_STREAM)
-        delivered = await subscription.fetch(messages)
-        got = [await js.get_msg(subjects.RAW_STREAM, number + 1) for number in range(messages)]
-        assert len(read) == messages
-        assert read == [parse_position(message.reply).received_s for message in delivered]
-        assert read == [int(message.time.timestamp()) for message in got]
-        assert abs(read[-1] - time.time()) < 60.0
-        await nc.close()
+    js, messages = nc.jetstream(), 20
+    for number in range(messages):
+        await js.publish(subjects.raw("p1"), b"%d" % number)
+    read = [each.received_s async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
+    subscription = await js.pull_subscribe("p.0.raw.*", durable="test", stream=subjects.RAW_STREAM)
+    delivered = await subscription.fetch(messages)
+    got = [await js.get_msg(subjects.RAW_STREAM, number + 1) for number in range(messages)]
+    assert len(read) == messages
+    assert read == [parse_position(message.reply).received_s for message in delivered]
+    assert read == [int(message.time.timestamp()) for message in got]
+    assert abs(read[-1] - time.time()) < 60.0
 
 
-async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_hours(tmp_path):
+async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_hours(
+    nc, cluster, heartbeats, tmp_path
+):
     """Send blocks before the worker starts, which it reads from the stream, and after that, which it gets delivered."""
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=1)
-        await load_packs(nc, ["p1", "p2"])
+    await load_packs(nc, ["p1", "p2"])
 
-        stores_s = {"p1": YEAR_2040_S, "p2": int(time.time()) - 86_400}
+    stores_s = {"p1": YEAR_2040_S, "p2": int(time.time()) - 86_400}
 
-        async def send_hour(number):
-            for pack, store_s in stores_s.items():
-                data = encode(Block(store_s * 10**9, number, 1, time.time(), samples_until(3600.0 * number)))
-                await send(nc, pack, data)
+    async def send_hour(number):
+        for pack, store_s in stores_s.items():
+            data = encode(Block(store_s * 10**9, number, 1, time.time(), samples_until(3600.0 * number)))
+            await send(nc, pack, data)
 
-        await send_hour(1)
-        await send_hour(2)
-        worker = Process(tmp_path, cluster.url, "w1")
-        try:
-            async with Heartbeats(nc) as heartbeats:
-                await heartbeats.until(lambda last: "w1" in last and last["w1"].counters.get("blocks") == 4)
-                await send_hour(3)
-                await heartbeats.until(lambda last: last["w1"].counters.get("blocks") == 6)
-                heartbeat = heartbeats.last["w1"]
-            assert (heartbeat.clock_error_count, list(heartbeat.clock_errors)) == (1, ["p1"])
-            assert heartbeat.clock_errors["p1"] == pytest.approx(YEAR_2040_S + 10_800 - time.time(), abs=60.0)
-            assert await worker.end() == 0
-            rows = {}
-            stream = (await nc.jetstream().stream_info(subjects.HOURS_STREAM)).state
-            for sequence in range(1, stream.last_seq + 1):
-                row = Hour.model_validate_json((await nc.jetstream().get_msg(subjects.HOURS_STREAM, sequence)).data)
-                rows.setdefault(row.pack, []).append(row)
-        finally:
-            worker.kill()
-        assert [row.clock_error_s is not None for row in rows["p1"]] == [True, True]
-        assert [row.clock_error_s for row in rows["p2"]] == [None, None]
-        assert [row.revision for row in rows["p1"]] == [3, 5]
-        assert all(abs(row.received_hour - time.time() / 3600) < 2 for row in rows["p1"] + rows["p2"])
-        await nc.close()
+    await send_hour(1)
+    await send_hour(2)
+    worker = Process(tmp_path, cluster.url, "w1")
+    try:
+        await heartbeats.until(lambda last: "w1" in last and last["w1"].counters.get("blocks") == 4)
+        await send_hour(3)
+        await heartbeats.until(lambda last: last["w1"].counters.get("blocks") == 6)
+        heartbeat = heartbeats.last["w1"]
+        assert (heartbeat.clock_error_count, list(heartbeat.clock_errors)) == (1, ["p1"])
+        assert heartbeat.clock_errors["p1"] == pytest.approx(YEAR_2040_S + 10_800 - time.time(), abs=60.0)
+        assert await worker.end() == 0
+        rows = {}
+        stream = (await nc.jetstream().stream_info(subjects.HOURS_STREAM)).state
+        for sequence in range(1, stream.last_seq + 1):
+            row = Hour.model_validate_json((await nc.jetstream().get_msg(subjects.HOURS_STREAM, sequence)).data)
+            rows.setdefault(row.pack, []).append(row)
+    finally:
+        worker.kill()
+    assert [row.clock_error_s is not None for row in rows["p1"]] == [True, True]
+    assert [row.clock_error_s for row in rows["p2"]] == [None, None]
+    assert [row.revision for row in rows["p1"]] == [3, 5]
+    assert all(abs(row.received_hour - time.time() / 3600) < 2 for row in rows["p1"] + rows["p2"])
 
 
 @pytest.mark.thorough
-async def test_edge_whose_clock_steps_back_by_days_loses_no_sample_and_is_not_silent(tmp_path, line):
+async def test_edge_whose_clock_steps_back_by_days_loses_no_sample_and_is_not_silent(
+    nc, cluster, heartbeats, tmp_path, line
+):
     """The clock is 5 days behind, then correct, then 3 days behind, also after restarts: with the store and without it."""
     line.plug()
-    with running(tmp_path, partitions=1) as cluster:
-        board = asyncio.create_task(Board(line).print_lines())
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=1)
-        await load_packs(nc, ["pack"])
-        worker = Process(tmp_path, cluster.url, "w1")
-        edge = EdgeWithClock(tmp_path, write_pack_file(tmp_path, line, cluster.mqtt_port))
-        try:
-            async with Heartbeats(nc) as heartbeats:
-                await edge.run(heartbeats, -5 * DAY_S, 0, -3 * DAY_S)
-                await edge.run(heartbeats, -3 * DAY_S)
-                for file in (tmp_path / "state-home").rglob("pack.edge.sqlite*"):
-                    file.unlink()
-                await edge.run(heartbeats, -3 * DAY_S)
-                stored = [each async for batch in read_stream(nc, subjects.RAW_STREAM, "p.0.raw.*") for each in batch]
-                decoded = [decode(each.data) for each in stored]
-                blocks = {(block.store_created_ns, block.number): block for block in decoded}  # some were sent again
-                await heartbeats.until(lambda last: last["w1"].counters["blocks"] == len(blocks))
-            heartbeat = heartbeats.last["w1"]
-            assert await worker.end() == 0
-        finally:
-            worker.kill()
-            await end(board)
-        stored = [each async for batch in read_stream(nc, subjects.HOURS_STREAM, ">") for each in batch]
-        rows = [Hour.model_validate_json(each.data) for each in stored]
-        await nc.close()
+    board = asyncio.create_task(Board(line).print_lines())
+    await load_packs(nc, ["pack"])
+    worker = Process(tmp_path, cluster.url, "w1")
+    edge = EdgeWithClock(tmp_path, write_pack_file(tmp_path, line, cluster.mqtt_port))
+    try:
+        await edge.run(heartbeats, nc, -5 * DAY_S, 0, -3 * DAY_S)
+        await edge.run(heartbeats, nc, -3 * DAY_S)
+        for file in (tmp_path / "state-home").rglob("pack.edge.sqlite*"):
+            file.unlink()
+        blocks = await edge.run(heartbeats, nc, -3 * DAY_S)
+        heartbeat = heartbeats.last["w1"]
+        assert await worker.end() == 0
+    finally:
+        worker.kill()
+        await end(board)
+    stored = [each async for batch in read_stream(nc, subjects.HOURS_STREAM, ">") for each in batch]
+    rows = [Hour.model_validate_json(each.data) for each in stored]
     first_store, last_store = sorted({store for store, _ in blocks})
     assert (last_store - first_store) / 1e9 == pytest.approx(2 * DAY_S, abs=2 * LONG_S)
     lines = np.concatenate([np.round((block.samples["voltage_v"] - 3.0) * 1e4) for _, block in sorted(blocks.items())])

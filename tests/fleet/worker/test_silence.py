@@ -1,6 +1,8 @@
-"""Partition lease that gets no deliveries: after the death of another worker, another owner, or an internal error."""
+"""Partition lease after the death of other workers, another owner, or an internal error."""
 
 import asyncio
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import nats
@@ -16,6 +18,7 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoi
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.table_in_force import PackLookup
+from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS
 from bms_estimator.fleet.worker.worker import Options, work
 from bms_estimator.process.tasks import end, until_first_ends
 from tests.fleet.nats_cluster import running
@@ -26,6 +29,8 @@ PARTITIONS = 4
 PACKS = ["p1", "p2", "p3"]
 BLOCKS = 3
 """Number of blocks of each pack."""
+REPLAYED_BLOCKS = 50
+"""Number of blocks of each pack in a guarded replay."""
 
 
 async def test_messages_delivered_to_a_dead_worker_are_processed_without_further_blocks(tmp_path: Path) -> None:
@@ -60,36 +65,50 @@ async def test_messages_delivered_to_a_dead_worker_are_processed_without_further
         await nc.close()
 
 
-async def test_block_with_an_internal_error_is_skipped_and_counted_as_a_fault(tmp_path: Path) -> None:
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await nats.connect(cluster.url)
-        await make_streams(nc, partitions=1)
-        registry = await load_packs(nc, PACKS)
+async def test_block_with_an_internal_error_is_skipped_and_counted_as_a_fault(nc: Client) -> None:
+    registry = await load_packs(nc, PACKS)
 
-        def table(pack: str):
-            if pack == "p1":
-                raise KeyError(pack)  # as by a bug
-            return registry(pack)
+    def table(pack: str):
+        if pack == "p1":
+            raise KeyError(pack)  # as by a bug
+        return registry(pack)
 
-        lease, running_lease = await _lease_after_first_blocks(nc, table)
+    async with _running_lease(nc, table, 1) as lease:
+        await until(lambda: lease.runner.blocks >= len(PACKS), lambda: lease.runner.blocks)
         assert lease.runner.faults == 1
         assert lease.partition
         assert lease.partition.counters["blocks"] == len(PACKS) - 1
-        await end(running_lease)
-        await nc.close()
 
 
-async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_the_checkpoint(
-    tmp_path: Path,
-) -> None:
-    with running(tmp_path, partitions=1) as cluster:
-        nc = await nats.connect(cluster.url)
-        await make_streams(nc, partitions=1)
-        registry = await load_packs(nc, PACKS)
-        lease, running_lease = await _lease_after_first_blocks(nc, registry)
+async def test_guarded_replay_reads_each_message_from_the_stream_once(nc: Client) -> None:
+    registry, blocks = await load_packs(nc, PACKS), REPLAYED_BLOCKS * len(PACKS)
+    await _claim_without_checkpoint(nc, GUARDED_CLAIMS)
+    async with _running_lease(nc, registry, REPLAYED_BLOCKS) as lease:
+        received = nc.stats["in_msgs"]
+        await until(lambda: lease.runner.blocks == blocks, lambda: lease.runner.blocks)
+        # each message is delivered and read
+        assert nc.stats["in_msgs"] - received < 3 * blocks
+
+
+async def test_guarded_replay_ends_when_another_worker_claims_the_partition(nc: Client) -> None:
+    registry, blocks = await load_packs(nc, PACKS), REPLAYED_BLOCKS * len(PACKS)
+    await _claim_without_checkpoint(nc, GUARDED_CLAIMS)
+    async with _running_lease(nc, registry, REPLAYED_BLOCKS) as lease:
+        await until(lambda: lease.runner.blocks, lambda: lease.runner.blocks)
+        await _claim_without_checkpoint(nc, 1)
+        await lease.save()
+        assert not lease.is_owned
+        dropped = lease.runner.blocks + 1  # one more is being processed
+        await until(lambda: lease.partition and lease.partition.sequence == blocks, lambda: lease.runner.blocks)
+        assert lease.runner.blocks <= dropped + blocks
+
+
+async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_the_checkpoint(nc: Client) -> None:
+    registry = await load_packs(nc, PACKS)
+    async with _running_lease(nc, registry, 1) as lease:
+        await until(lambda: lease.runner.blocks >= len(PACKS), lambda: lease.runner.blocks)
         # another worker claims the partition and dies, so that its pin lapses
-        other_store = await open_checkpoints(nc, "other")
-        await other_store.claim(0)
+        await _claim_without_checkpoint(nc, 1)
 
         def is_fenced() -> object:
             lease.check_silence()
@@ -105,8 +124,6 @@ async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_t
             state = lease.partition.state(pack)
             assert state is not None
             assert estimates_of(state["estimator"]) == estimated(registry, pack, 1)
-        await end(running_lease)
-        await nc.close()
 
 
 def _pack_count(partition: int) -> int:
@@ -114,10 +131,13 @@ def _pack_count(partition: int) -> int:
     return sum(subjects.partition_of(pack, PARTITIONS) == partition for pack in PACKS)
 
 
-async def _lease_after_first_blocks(nc: Client, table: PackLookup) -> tuple[PartitionLease, asyncio.Task[None]]:
-    """Run a lease of the only partition, and send it the first block of each pack. Return the lease and its task."""
-    inbox = nc.new_inbox()
-    block_loop = BlockLoop()
+@asynccontextmanager
+async def _running_lease(nc: Client, table: PackLookup, blocks: int) -> AsyncGenerator[PartitionLease, None]:
+    """Run a lease of the only partition, whose stream has ``blocks`` blocks of each pack."""
+    for number in range(1, blocks + 1):
+        for pack in PACKS:
+            await send(nc, pack, block(pack, number))
+    inbox, block_loop = nc.new_inbox(), BlockLoop()
     lease = PartitionLease(
         nc,
         0,
@@ -131,11 +151,18 @@ async def _lease_after_first_blocks(nc: Client, table: PackLookup) -> tuple[Part
     )
     await _subscribe(nc, f"{inbox}.0.*", lease.receive)
     running_lease = asyncio.create_task(until_first_ends(lease.run(), block_loop.run()))
-    for pack in PACKS:
-        await send(nc, pack, block(pack, 1))
     await lease.consumer.renew()
-    await until(lambda: lease.runner.blocks >= len(PACKS), lambda: lease.runner.blocks)
-    return lease, running_lease
+    try:
+        yield lease
+    finally:
+        await end(running_lease)
+
+
+async def _claim_without_checkpoint(nc: Client, claims: int) -> None:
+    """Claim the only partition as workers that die before their first checkpoint."""
+    store = await open_checkpoints(nc, "other")
+    for _ in range(claims):
+        await store.claim(0)
 
 
 async def _receive_and_die(nc: Client, partition: int, messages: int) -> None:

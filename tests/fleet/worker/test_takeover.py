@@ -1,7 +1,9 @@
 """Deaths of holders in a guarded replay, counted on the real server."""
 
 import pytest
+from nats.aio.client import Client
 
+from bms_estimator.edge import subjects
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
@@ -46,6 +48,12 @@ async def test_blocks_after_the_replay_are_not_written_down(store: CheckpointSto
     guard = await claim_guarded(store)
     assert not await guard.is_lethal(END_SEQUENCE + 1)
     assert (await store.replays.read(0)).sequence == 0
+
+
+async def test_guarded_replay_does_not_wait_for_the_leader_of_the_bucket(nc: Client, store: CheckpointStore) -> None:
+    guard = await claim_guarded(store)
+    await nc.jetstream().delete_stream(f"KV_{subjects.CHECKPOINTS_BUCKET}")
+    assert not await guard.is_lethal(5)
 
 
 @pytest.mark.parametrize("is_saved", [True, False], ids=["after a checkpoint", "after an orderly release"])

@@ -69,9 +69,9 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
             workers[name] = Process(tmp_path, ",".join(cluster.urls), name, "--checkpoint-s", 1)
             stack.callback(workers[name].kill)
 
-        def count_blocks(last: Mapping[str, Heartbeat]) -> int:
-            """Return the number of blocks that the partitions of the running workers have processed."""
-            return sum(last[name].counters.get("blocks", 0) for name in workers if name in last)
+        def count(last: Mapping[str, Heartbeat], counter: str = "blocks") -> int:
+            """Return the sum of a counter over the partitions of the running workers."""
+            return sum(last[name].counters.get(counter, 0) for name in workers if name in last)
 
         start_worker()
         start_worker()
@@ -85,7 +85,7 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
         )
         async with Heartbeats(nc) as heartbeats:
             await heartbeats.until_held(PARTITIONS, *workers)
-            await heartbeats.until(count_blocks)
+            await heartbeats.until(count)
             rng, kills = random.Random(SEED), Counter[str]()
             for kill in range(KILLS):
                 await asyncio.sleep(rng.expovariate(1.0 / MEAN_UPTIME_S))
@@ -103,15 +103,16 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
             workers[suspended].signal(signal.SIGCONT)
             await workers[suspended].logged("fenced out")
             await heartbeats.until_held(PARTITIONS, *workers)
-            edges.last = int(edges.next_number.max()) + BLOCKS_AFTER_KILLS
+            edges.last = int(edges.first_unsent.max()) + BLOCKS_AFTER_KILLS
             processed_blocks = 0
             while processed_blocks < edges.last * PACKS:  # a busy machine may take longer than the limit of one wait
                 try:
                     async with asyncio.timeout(2.0 * RESEND_S):
-                        await heartbeats.until(lambda last, before=processed_blocks: count_blocks(last) > before)
+                        await heartbeats.until(lambda last, before=processed_blocks: count(last) > before)
                 except TimeoutError:  # a worker requests a missing block again only when later ones arrive
                     edges.last += REQUEST_EVERY
-                processed_blocks = count_blocks(heartbeats.last)
+                processed_blocks = count(heartbeats.last)
+                assert count(heartbeats.last, "lethal") == 0
         assert processed_blocks == edges.last * PACKS
         stop.set()
         sys.stdout.write(f"{NODES} nodes, kills: {dict(kills)}; {await publisher_task}\n")

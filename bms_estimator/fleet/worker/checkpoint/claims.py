@@ -7,6 +7,7 @@ A change of the checkpoints from outside the worker claims the partition as a wo
 drops the partition from its memory, and takes it over again from the changed checkpoints.
 """
 
+import asyncio
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,6 +24,10 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFo
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import object_name
 
 log = structlog.get_logger(__name__)
+
+
+RECEIPT_TIMEOUT_S = 2
+"""Timeout of the server's receipt of a record [s]."""
 
 
 class ReplayRecord(BaseModel):
@@ -54,12 +59,18 @@ class ReplayRecords:
         except (KeyNotFoundError, ValidationError):
             return ReplayRecord()
 
-    async def write(self, partition: int, record: ReplayRecord) -> None:
-        """Store the record of a guarded replay."""
-        await self._bucket.put(_key(partition), record.model_dump_json().encode())
+    async def deliver(self, partition: int, record: ReplayRecord) -> None:
+        """Send the record of a guarded replay, and wait until the server has received it.
+
+        Its storage is not awaited, because each worker that is killed while no node leads the stream would seem to die of the
+        first block of its replay.
+        """
+        await self.send(partition, record)
+        await asyncio.sleep(0)  # nats-py writes the ping of a flush at once, and other messages in a task
+        await self._nc.flush(RECEIPT_TIMEOUT_S)
 
     async def send(self, partition: int, record: ReplayRecord) -> None:
-        """Send the record of a guarded replay without waiting for its storage."""
+        """Send the record of a guarded replay."""
         subject = f"$KV.{subjects.CHECKPOINTS_BUCKET}.{_key(partition)}"
         await self._nc.publish(subject, record.model_dump_json().encode())
 
