@@ -33,8 +33,6 @@ from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.arrays import Records, structured_array
-from bms_estimator.model.cell import CellModel
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import fill_temperature
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.sinks.trace_file import table_sink
@@ -67,9 +65,8 @@ def validate_command(
 
     The parameters are constant. The measured voltage is used only for the SOC of the first rest.
     """
-    settings, model = pack_or_cell(None, cell, capacity_ah, series)
-    if not isinstance(model, CellModel):
-        raise UserError(f"{model.cell.name} is a fuel cell: validate needs a battery cell")
+    settings, pack_model = pack_or_cell(None, cell, capacity_ah, series)
+    model = pack_model.battery(f"{pack_model.cell.name} is a fuel cell: validate needs a battery cell")
     if soc is not None:
         settings = with_pack(settings, initial_soc=soc)
     (loaded,) = load_captures([capture], current_sign=current_sign, column_map=column_map)
