@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import LONG_REST_S, ends_of_long_rests
-from bms_estimator.calibration.reference import ReferenceFault, reference_faults
+from bms_estimator.calibration.reference import reference_faults
 from bms_estimator.calibration.soc_errors import SocErrors
 from bms_estimator.calibration.validate import LOW_SOC, Validation
 from bms_estimator.model.arrays import Floats
@@ -162,7 +162,7 @@ def judge(runs: Sequence[Run], cell: CellModel, covered: Coverage | None = None)
     covered = covered or coverage([run.validation for run in runs], cell)
     unfitted = [run for run in runs if not run.is_fitted]
     judged = unfitted or list(runs)
-    faults = [_faults_of(run, cell) for run in judged]
+    faults = [reference_faults(run.validation, cell, GOOD_RMS_V, run.soc_errors.faults) for run in judged]
     sound = [run for run, found in zip(judged, faults, strict=True) if not any(f.affects_voltage for f in found)]
     errors = voltage_errors([run.validation for run in sound or judged], cell)
     grade: Grade | None = grade_voltage(errors)
@@ -185,11 +185,6 @@ def judge(runs: Sequence[Run], cell: CellModel, covered: Coverage | None = None)
 def is_fitted_to(cell: CellModel, samples: SampleBlock) -> bool:
     """Return True if the cell file was fitted to the capture with these samples. They must be complete and unchanged."""
     return cell.fit is not None and capture_digest(samples) in cell.fit.captures
-
-
-def _faults_of(run: Run, cell: CellModel) -> list[ReferenceFault]:
-    """Return the errors of the reference of a comparison."""
-    return reference_faults(run.validation, cell, GOOD_RMS_V, run.soc_errors.faults)
 
 
 def grade_voltage(errors: VoltageErrors) -> Grade:

@@ -18,6 +18,7 @@ import numpy as np
 import structlog
 
 from bms_estimator.model.payloads.health import Totals
+from bms_estimator.process.instance_lock import is_locked
 from bms_estimator.process.private_file import overwrite_private, read_private, write_private
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, new_totals
 
@@ -184,9 +185,13 @@ class RunFile:
         return any(pattern.fullmatch(path.name) for path in self._folder_content())
 
     def _other_pack_with_alarm(self) -> str:
-        """Return a reason if another pack has a raised or due critical alarm or a lost sensor: this one may be that pack, renamed."""
+        """Return a reason if another pack has a raised or due critical alarm or a lost sensor: this one may be that pack, renamed.
+
+        A pack that is served at present has not been renamed.
+        """
+        folder = self.path.parent
         for path in self._folder_content():
-            if path.suffix == ".run" and not path.name.endswith(".refused.run"):
+            if path.suffix == ".run" and not path.name.endswith(".refused.run") and not is_locked(folder, path.stem):
                 with contextlib.suppress(Exception):  # a damaged file concerns the other pack
                     alarms = json.loads(_read(path)["alarms"] or "{}")
                     inputs = alarms.pop("inputs", {}).values()

@@ -20,7 +20,6 @@ from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import SAMPLE, SampleBlock
@@ -77,7 +76,7 @@ class Estimator:
         sampling: Sampling = EXACT,
         limits: ChargeLimits = NO_LIMITS,
     ) -> None:
-        self.cell = between_limits(cell, limits) if isinstance(cell, CellModel) else cell
+        self.cell = cell.by_kind(lambda battery: between_limits(battery, limits), lambda stack: stack)
         self.settings_record = estimator_settings(
             self.cell,
             observer or ObserverSettings(),

@@ -49,36 +49,31 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
     Raises:
         UserError: The cut-off voltage of the load is not below the voltage of the full pack.
     """
-    if isinstance(cell, FuelCellModel):
-        lines = [_voltage_out_of_range(settings, _no_load_v(cell), "at no load"), *_ignored(settings, cell)]
-    else:
-        checks = (
-            _too_large_capacity,
-            _series_counted_twice,
-            _implausible_cell_voltage,
-            _missing_parallel,
-            _full_voltage_off_curve,
-            _cutoff_voltage_off_curve,
-            _implausible_load_cutoff,
-            _more_cells_than_series,
-        )
-        full_v = float(ocv_grid(cell)[0][-1])
-        lines = [
-            *(check(settings, cell) for check in checks),
-            _voltage_out_of_range(settings, full_v, "when full"),
-            *_current_limits_without_effect(settings, cell),
-        ]
+    lines = cell.by_kind(lambda battery: _battery_lines(settings, battery), lambda stack: _stack_lines(settings, stack))
     return [line for line in lines if line]
 
 
-def _no_load_v(cell: FuelCellModel) -> float:
-    """Return the highest voltage of a stack at the file's temperature [V]."""
-    voltage_v, _ = polarisation(cell.a, np.zeros(LEARNABLE), np.zeros(1), np.full(1, np.nan))
-    return float(voltage_v[0])
+def _battery_lines(settings: Settings, cell: CellModel) -> Iterator[str | None]:
+    """Yield one line for each implausible setting of a battery; None: the setting is plausible."""
+    checks = (
+        _too_large_capacity,
+        _series_counted_twice,
+        _implausible_cell_voltage,
+        _missing_parallel,
+        _full_voltage_off_curve,
+        _cutoff_voltage_off_curve,
+        _implausible_load_cutoff,
+        _more_cells_than_series,
+    )
+    yield from (check(settings, cell) for check in checks)
+    yield _voltage_out_of_range(settings, float(ocv_grid(cell)[0][-1]), "when full")
+    yield from _current_limits_without_effect(settings, cell)
 
 
-def _ignored(settings: Settings, cell: FuelCellModel) -> Iterator[str]:
-    """Yield a line for each setting that a fuel cell ignores."""
+def _stack_lines(settings: Settings, cell: FuelCellModel) -> Iterator[str | None]:
+    """Yield one line for each implausible setting, and for each setting that a fuel cell ignores."""
+    no_load_v, _ = polarisation(cell.a, np.zeros(LEARNABLE), np.zeros(1), np.full(1, np.nan))
+    yield _voltage_out_of_range(settings, float(no_load_v[0]), "at no load")
     if "law" in settings.observer.model_fields_set and settings.observer.law != "learning":
         yield f"observer.law = {settings.observer.law!r}: ignored: a fuel cell ({cell.cell.name}) always has 'learning'"
     if "enabled" in settings.identifier.model_fields_set and settings.identifier.enabled:

@@ -79,8 +79,12 @@ def observer_warnings(observer: ObserverSettings, cell: PackModel) -> Iterator[s
 
     A fuel cell and the law ``learning`` use neither (3.18) nor N(k), so that they give no warning.
     """
-    if not isinstance(cell, CellModel) or observer.law == "learning":
-        return
+    if observer.law != "learning":
+        yield from cell.by_kind(lambda battery: _battery_warnings(observer, battery), lambda _: ())
+
+
+def _battery_warnings(observer: ObserverSettings, cell: CellModel) -> Iterator[str]:
+    """Yield the warnings of a battery."""
     if observer.law in LAWS_WITH_BOUNDS:
         for condition in failed_conditions(cell):
             yield (

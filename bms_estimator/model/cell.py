@@ -10,11 +10,11 @@ of such objects in series and parallel.
 import itertools
 import math
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,8 @@ from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.one_of import suggestion
 
+Result = TypeVar("Result")
+"""Result of ``CellModel.by_kind``."""
 ELEMENTS = {
     "r_ts": (1, "amplitude_ohm", "offset_ohm"),  # (2.5)
     "r_tl": (4, "amplitude_ohm", "offset_ohm"),  # (2.6)
@@ -248,6 +250,8 @@ class CellModel(Strict):
     """Reason why the estimator of this model makes no forecasts, if it makes none."""
     always_learns: ClassVar[bool] = False
     """False: the observer uses the configured law."""
+    min_voltage_ratio: ClassVar[float] = 0.6
+    """Minimum voltage relative to the nominal voltage. A full pack with half as many cells has less."""
 
     @model_validator(mode="after")
     def _known_parameters(self) -> Self:
@@ -255,6 +259,14 @@ class CellModel(Strict):
         for name in self.adaptation:
             if name not in known:
                 raise ValueError(f"adaptation.{name}: no such parameter; a1 to a15 adapt")
+        return self
+
+    def by_kind(self, battery: Callable[["CellModel"], Result], _stack: object) -> Result:
+        """Return the result of the first function, that of a battery, for this model."""
+        return battery(self)
+
+    def battery(self, _error: str) -> "CellModel":
+        """Return this model, which is that of a battery."""
         return self
 
     @property

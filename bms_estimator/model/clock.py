@@ -18,10 +18,6 @@ class Clock:
     wall: Callable[[], float] = time.time
     monotonic: Callable[[], float] = since_boot
 
-    def utc(self) -> str:
-        """Return the present wall clock time in ISO 8601."""
-        return iso_utc(self.wall())
-
 
 def iso_utc(epoch_s: float) -> str:
     """Return seconds since 1970 in ISO 8601, UTC, with milliseconds: ``2024-05-01T12:00:00.250Z``."""

@@ -5,15 +5,16 @@ several such stacks. A fuel cell has no capacity and no SOC.
 """
 
 import math
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from bms_estimator.model.cell import Rated, cell_file_path, shipped_fuel_cells
+from bms_estimator.model.cell import Rated, Result, cell_file_path, shipped_fuel_cells
 from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml
 from bms_estimator.model.errors import UserError
 
@@ -85,6 +86,20 @@ class FuelCellModel(Strict):
     """Reason why the estimator of this model makes no forecasts."""
     always_learns: ClassVar[bool] = True
     """True: the observer uses the law ``learning``, whatever is configured."""
+    min_voltage_ratio: ClassVar[float] = 0.0
+    """Minimum voltage relative to the nominal voltage. A stack without gas has none."""
+
+    def by_kind(self, _battery: object, stack: Callable[["FuelCellModel"], Result]) -> Result:
+        """Return the result of the second function, that of a stack, for this model."""
+        return stack(self)
+
+    def battery(self, error: str) -> NoReturn:
+        """Reject this model where a battery is needed.
+
+        Raises:
+            UserError: Always, with the text ``error``.
+        """
+        raise UserError(error)
 
     @property
     def capacity_ah(self) -> None:

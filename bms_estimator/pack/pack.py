@@ -19,7 +19,6 @@ from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.load_history import restore_load
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import NO_CELLS, NO_SOC, CellBlock, SampleBlock
 from bms_estimator.pack.declared_capacity import with_capacity
@@ -319,12 +318,11 @@ def assemble(
         UserError: The cut-off voltage is not below the voltage of the full pack.
     """
     slow_fit = forecaster = None
-    model = estimator.cell
     if estimator.identifying and settings.identifier.pack_model:
         slow_fit = new_fit(estimator, settings.identifier.fit_interval_s or FIT_INTERVAL_S)
-    if has_load and estimator.identifying and isinstance(model, CellModel):
-        cutoff_v = load_cutoff_v(settings, model)
-        forecaster = Forecaster(estimator, cutoff_v=cutoff_v, limits=power_limits(settings, model))
+    if has_load and estimator.identifying:
+        cell = estimator.cell.battery("the identifier is of batteries")
+        forecaster = Forecaster(estimator, cutoff_v=load_cutoff_v(settings, cell), limits=power_limits(settings, cell))
     device_soc_std = settings.pack.device_soc_std if estimator.identifying else None
     return Pack(
         estimator,

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -26,7 +25,7 @@ class Declared(NamedTuple):
     @classmethod
     def by(cls, model: PackModel) -> "Declared | None":
         """Return the values of a model; None for a fuel cell."""
-        return cls(model.cell.capacity_ah, model.r_s.offset_ohm) if isinstance(model, CellModel) else None
+        return model.by_kind(lambda cell: cls(cell.capacity_ah, cell.r_s.offset_ohm), lambda _: None)
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,16 @@ from typing import Literal, NamedTuple
 
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, AlarmKind
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
-from bms_estimator.settings.collapse_limit import collapse_limit
+from bms_estimator.settings.false_alarm_limits import (
+    DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH,
+    collapse_limit,
+    weak_cell_limit,
+)
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.weak_cell_limit import DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH, weak_cell_limit
 
 MIN_SILENT_LIMIT_S = 10.0
 """Minimum default limit of ``link_lost`` [s]."""
@@ -236,7 +240,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         # the value is infinite after a failure, otherwise 0
         "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0),
     }
-    return all_packs | (_battery_defaults(cell) if isinstance(cell, CellModel) else _stack_defaults(cell))
+    return all_packs | cell.by_kind(_battery_defaults, _stack_defaults)
 
 
 def _collapse_default(settings: Settings) -> _Default:
@@ -278,7 +282,7 @@ def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
     }
 
 
-def _stack_defaults(cell: PackModel) -> dict[AlarmName, _Default]:
+def _stack_defaults(cell: FuelCellModel) -> dict[AlarmName, _Default]:
     """Return the defaults of a fuel cell, which has no cell voltages and must not be charged."""
     c = cell.cell
     return {

@@ -28,7 +28,6 @@ from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.stability_margin import VALID_FIT_STD, VALID_STD
 from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.monotone_cubic import MonotoneCubic
 from bms_estimator.model.payloads.snapshot import OcvCurve, Parameter, ParameterReport
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
@@ -110,20 +109,25 @@ def make_parameters_payload(estimator: Estimator, now_s: float) -> ParameterRepo
         estimator: Read only.
         now_s: Wall clock [s since 1970].
     """
-    if isinstance(estimator.cell, FuelCellModel):
-        return _fuel_cell_report(estimator, now_s)
-    a, state = estimator.cell.a.copy(), estimator.state[0]
+    return estimator.cell.by_kind(
+        lambda cell: _battery_report(estimator, cell, now_s), lambda _: _fuel_cell_report(estimator, now_s)
+    )
+
+
+def _battery_report(estimator: Estimator, cell: CellModel, now_s: float) -> ParameterReport:
+    """Return the payload of a battery."""
+    a, state = cell.a.copy(), estimator.state[0]
     if not state["started"]:
         return ParameterReport(
             publish_time=iso_utc(now_s),
             soc=None,
-            a=_with_units(_cell_file_parameters(estimator.cell, a)),
+            a=_with_units(_cell_file_parameters(cell, a)),
             ocv=None,
             elements={},
             state_of_health={},
         )
     a[1:16] = state["a"][1:16]
-    parameters, elements = _cell_file_parameters(estimator.cell, a), _elements_of(estimator, a)
+    parameters, elements = _cell_file_parameters(cell, a), _elements_of(estimator, a)
     health: dict[str, Parameter] = {}
     learning, record = bool(estimator.settings_record["learning"]["enabled"][0]), estimator.record[0]
     from_data = _is_data_driven(estimator)

@@ -27,6 +27,7 @@ from bms_estimator.model.events import events
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import checkpoint_writer, relay_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
@@ -337,6 +338,13 @@ async def test_a_renamed_pack_takes_the_safe_side_while_its_former_name_has_an_a
     renamed = await run(folder, NORMAL, edit_settings("pack", name="renamed"))
     assert "pack has an alarm in pack.run" in renamed.alarms["alarm_state_lost"].text
     assert not any(renamed.relay)
+
+
+async def test_a_new_pack_beside_a_running_one_with_an_alarm_raises_none(folder: Path) -> None:
+    with instance_lock(folder, "pack"):
+        second = await run(folder, NORMAL, edit_settings("pack", name="second"))
+    assert not second.alarms["alarm_state_lost"].active
+    assert all(second.relay)
 
 
 async def test_an_alarm_that_is_disabled_while_it_is_raised_needs_an_acknowledgement(folder: Path) -> None:

@@ -259,14 +259,14 @@ def result_table(title: str, result: ReplayResult) -> Table:
     table.add_column(style="dim")
     table.add_column(justify="right")
     lock_text = f"[red]lost {result.lock_losses} times[/]" if result.lock_lost else "[green]kept[/]"
-    is_fuel_cell = result.soc_final is None
+    has_soc = result.soc_final is not None
     rows = {
         "samples": f"{result.samples:,}",
         "dropped": _dropped_text(result),
         **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
         **({"clock set back": _set_back_text(result)} if result.time_steps_back else {}),
         "duration": _number_text(result.duration_s, ",.1f", "s"),
-        **({} if is_fuel_cell else _soc_rows(result)),
+        **(_soc_rows(result) if has_soc else {}),
         "innovation, RMS": _number_text(result.innovation_rms_v, ".3f", "mV", 1e3),
         "observer: tracking error, RMS": _number_text(result.tracking_error_rms_v, ".3f", "mV", 1e3),
         "observer: lock": lock_text,
@@ -276,7 +276,7 @@ def result_table(title: str, result: ReplayResult) -> Table:
     parameter_rows = {
         name: f"{'' if p.valid else 'not valid: '}{_number_text(p.value, '.4g')} ± {_number_text(p.std, '.2g')}"
         for name, p in result.parameters.items()
-        if is_fuel_cell  # a1..a21 of a battery are in the JSON only
+        if not has_soc  # a1..a21 of a battery are in the JSON only
     }
     for name, value in (rows | parameter_rows).items():
         table.add_row(name, value)

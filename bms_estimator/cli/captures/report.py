@@ -35,7 +35,6 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.pack_model.aging_course import aging_course
@@ -55,8 +54,6 @@ from bms_estimator.store.history_reader import HistoryReader
 
 CAPACITY = "capacity [Ah]"
 """Name of the learned capacity."""
-MIN_VOLTAGE_RATIO = 0.6
-"""Minimum voltage of a pack, relative to its nominal voltage. A full pack with half as many cells has less."""
 
 
 def pack_history(settings: Settings, model: PackModel, folder: Path | None, since_s: float) -> PackHistory:
@@ -85,7 +82,10 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
     except UserError as error:
         not_learned = str(error)
     events = file.events(since_s, until_s)
-    aging = _aging_history(files, settings, model)
+    aging = model.by_kind(
+        lambda cell: _aging_history(files, settings, cell),
+        lambda _: AgingHistory(None, "Only batteries have a capacity and resistances over days."),
+    )
     if aging.course:
         learned = [row for row in learned if row[0] != CAPACITY]  # the table of the slow fit has the capacity
     warnings = _implausible_voltages(model, columns["voltage_v"], path)
@@ -95,7 +95,7 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
 def _implausible_voltages(model: PackModel, voltage_v: Floats, path: Path) -> list[str]:
     """Return a warning if a history has voltages that the pack cannot have, as from another pack of its name."""
     cell = model.cell
-    low_v = 0.0 if isinstance(model, FuelCellModel) else MIN_VOLTAGE_RATIO * cell.nominal_voltage_v
+    low_v = model.min_voltage_ratio * cell.nominal_voltage_v
     outside_v = voltage_v[(voltage_v < low_v) | (voltage_v > cell.voltage_max_v)]
     if outside_v.size == 0:
         return []
@@ -108,10 +108,8 @@ def _implausible_voltages(model: PackModel, voltage_v: Floats, path: Path) -> li
     return [text]
 
 
-def _aging_history(files: StateFiles, settings: Settings, model: PackModel) -> AgingHistory:
+def _aging_history(files: StateFiles, settings: Settings, model: CellModel) -> AgingHistory:
     """Return capacity and resistances over the days of the history to which the service fits the pack's model."""
-    if isinstance(model, FuelCellModel):
-        return AgingHistory(None, "Only batteries have a capacity and resistances over days.")
     file = files.history
     try:
         arrays = file.load()
@@ -133,10 +131,9 @@ def _learned_parameters(files: StateFiles, model: PackModel) -> list[tuple[str, 
     Raises:
         UserError: There is no valid checkpoint, or the pack is a fuel cell.
     """
-    if isinstance(model, FuelCellModel):
-        raise UserError("a fuel cell has no capacity and no elements over SOC")
+    cell = model.battery("a fuel cell has no capacity and no elements over SOC")
     estimator = files.saved_pack().pack.estimator
-    record, rated_ah = estimator.record[0], model.cell.capacity_ah
+    record, rated_ah = estimator.record[0], cell.capacity_ah
     capacity = relative_capacity(record)
     rows = [(CAPACITY, number(capacity.value * rated_ah), number(capacity.std * rated_ah, 2))]
     for name, element in present_elements(record).items():
@@ -238,9 +235,8 @@ def report_on_captures(
         temperature_c: Temperature of captures without a sensor [°C]; None: the default of the model.
         verdict: Verdict of the calibration that made the cell file; None: by the captures.
     """
-    settings, model = pack_or_cell(pack, cell, capacity_ah, series)
-    if not isinstance(model, CellModel):
-        raise UserError(f"{model.cell.name} is a fuel cell: report needs a battery")
+    settings, pack_model = pack_or_cell(pack, cell, capacity_ah, series)
+    model = pack_model.battery(f"{pack_model.cell.name} is a fuel cell: report needs a battery")
     if soc is not None:
         settings = with_pack(settings, initial_soc=soc)
     names = unique_names([file.name for file in files], files)

@@ -1,7 +1,6 @@
 """``bms-estimator validate``: comparison of a cell's model with a capture."""
 
 import json
-import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,11 +32,10 @@ from bms_estimator.cli.options.number_options import decimal
 from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.arrays import Records, structured_array
-from bms_estimator.model.cell import CellModel
-from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import fill_temperature
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.sinks.trace_file import table_sink
+from bms_estimator.telemetry.state import finite
 
 
 def validate_command(
@@ -67,9 +65,8 @@ def validate_command(
 
     The parameters are constant. The measured voltage is used only for the SOC of the first rest.
     """
-    settings, model = pack_or_cell(None, cell, capacity_ah, series)
-    if not isinstance(model, CellModel):
-        raise UserError(f"{model.cell.name} is a fuel cell: validate needs a battery cell")
+    settings, pack_model = pack_or_cell(None, cell, capacity_ah, series)
+    model = pack_model.battery(f"{pack_model.cell.name} is a fuel cell: validate needs a battery cell")
     if soc is not None:
         settings = with_pack(settings, initial_soc=soc)
     (loaded,) = load_captures([capture], current_sign=current_sign, column_map=column_map)
@@ -120,7 +117,7 @@ def _json_result(validation: Validation, verdict: Verdict) -> dict[str, Any]:
             "glitches": validation.glitches,
             "resting": _errors(validation.resting),
             "loaded": _errors(validation.loaded),
-            "extra_series_resistance_ohm": _finite_or_none(validation.extra_ohm),
+            "extra_series_resistance_ohm": finite(validation.extra_ohm),
             "with_extra_series_resistance": _errors(validation.with_extra_ohm),
             "grade": verdict.grade,
             "verdict": verdict.text,
@@ -132,14 +129,10 @@ def _json_result(validation: Validation, verdict: Verdict) -> dict[str, Any]:
 def _errors(errors: Errors) -> dict[str, Any]:
     return {
         "samples": errors.samples,
-        "voltage_rms_mv": _finite_or_none(1e3 * errors.voltage_rms_v),
-        "mean_abs_percent": _finite_or_none(errors.mean_abs_percent),
-        "max_abs_percent": _finite_or_none(errors.max_abs_percent),
+        "voltage_rms_mv": finite(1e3 * errors.voltage_rms_v),
+        "mean_abs_percent": finite(errors.mean_abs_percent),
+        "max_abs_percent": finite(errors.max_abs_percent),
     }
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _tables(capture: Path, validation: Validation, verdict: Verdict) -> Group:

@@ -17,7 +17,6 @@ from bms_estimator.cli.options.pack_options import pack_or_cell
 from bms_estimator.cli.options.table import print_table
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.kalman_filter.anchors import FULL
-from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements
@@ -76,8 +75,7 @@ def accuracy(
     if pack is None and between is None:
         raise UserError("give --pack pack.toml, or --cell NAME with --between LOW HIGH")
     settings, model = pack_or_cell(pack, cell, capacity_ah)
-    if not isinstance(model, CellModel):
-        raise UserError(f"{model.cell.name}: a fuel cell has no SOC")
+    model.battery(f"{model.cell.name}: a fuel cell has no SOC")
     present_std, full_charges = None, None
     if pack is None:
         window = Window(0.0, has_temperature=False)

@@ -78,13 +78,9 @@ def history(
 
 
 def _write_csv(file: IO[str], header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write rows as CSV, with times as ISO 8601 text."""
+    """Write rows as CSV, with times as ISO 8601 text and floats with six significant digits."""
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(["time", *header[1:]])
     for time_s, *values in rows:
-        writer.writerow([iso_utc(float(str(time_s))), *(_shortened(value) for value in values)])
-
-
-def _shortened(value: object) -> object:
-    """Return a float with six significant digits; another value unchanged."""
-    return f"{value:.6g}" if isinstance(value, float) else value
+        shortened = (f"{value:.6g}" if isinstance(value, float) else value for value in values)
+        writer.writerow([iso_utc(float(str(time_s))), *shortened])

@@ -7,7 +7,6 @@ from pydantic import ValidationError
 from bms_estimator.model.cell import CellModel, generic_cells, load_cell
 from bms_estimator.model.config_file import error_reason, without_secrets
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.pack_model import PackModel, load_model
 from bms_estimator.protocols.base.device import BMS_GAIN_STD
 from bms_estimator.settings.mqtt import MqttSettings
@@ -97,8 +96,7 @@ def reject_soc_for_fuel_cell(model: PackModel, key: str) -> None:
     Raises:
         UserError: The model is a fuel cell.
     """
-    if isinstance(model, FuelCellModel):
-        raise UserError(f"{key}: {model.cell.name} is a fuel cell, which has no state of charge; remove {key}")
+    model.battery(f"{key}: {model.cell.name} is a fuel cell, which has no state of charge; remove {key}")
 
 
 def with_pack(settings: Settings, **changes: object) -> Settings:

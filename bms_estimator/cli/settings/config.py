@@ -57,6 +57,20 @@ def show(
         typer.echo(f"# {name} = {value:.6g}")
 
 
+def _derived_of_battery(settings: Settings, cell: CellModel) -> dict[str, float]:
+    """Return the values that only a battery has."""
+    # values to which the observer adapts a7..a9 of C_ts and a10..a12 of C_tl
+    a = {i: cell.bounds(i).limit for i in range(7, 13)}
+    return {
+        "pack.capacity_ah": cell.cell.capacity_ah,
+        "pack.cutoff_v": load_cutoff_v(settings, cell),
+        # SOC below which C_ts is negative, (2.11) of the thesis
+        "observer.delta_1": delta(exponent=a[8], offset=a[9], amplitude=a[7]),
+        # SOC below which C_tl is negative, (2.12) of the thesis
+        "observer.delta_2": delta(exponent=a[11], offset=a[12], amplitude=a[10]),
+    }
+
+
 def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
     """Return values of pack, observer and alarms that follow from the settings and the cell, by dotted name."""
     records = estimator_settings(
@@ -78,15 +92,7 @@ def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
         "observer.lock_error_v": observer["lock_error_v"],
         "publish_period_s": 1.0 / settings.publish.rate_hz,
     }
-    if isinstance(cell, CellModel):
-        # values to which the observer adapts a7..a9 of C_ts and a10..a12 of C_tl
-        a = {i: cell.bounds(i).limit for i in range(7, 13)}
-        values["pack.capacity_ah"] = cell.cell.capacity_ah
-        values["pack.cutoff_v"] = load_cutoff_v(settings, cell)
-        # SOC below which C_ts is negative, (2.11) of the thesis
-        values["observer.delta_1"] = delta(exponent=a[8], offset=a[9], amplitude=a[7])
-        # SOC below which C_tl is negative, (2.12) of the thesis
-        values["observer.delta_2"] = delta(exponent=a[11], offset=a[12], amplitude=a[10])
+    values |= cell.by_kind(lambda battery: _derived_of_battery(settings, battery), lambda _: {})
     for alarm in monitored_alarms(settings, cell):
         values[f"alarms.{alarm.name}.limit"], values[f"alarms.{alarm.name}.clear"] = alarm.limit, alarm.clear
     return values

@@ -157,13 +157,13 @@ class SampleAssembler:
         absent = [name for name in REQUIRED_QUANTITIES if (name, 0, 1) not in self._values]
         if len(absent) == len(REQUIRED_QUANTITIES):
             retained = " but retained messages" if self._counters["retained"] else ""
-            return f"no message on {', '.join(dict.fromkeys(self._find_topics(*REQUIRED_QUANTITIES)))}{retained}"
-        return f"{absent[0]}: no message on {', '.join(self._find_topics(absent[0]))}" if absent else None
+            return f"no message on {self._name_topics(*REQUIRED_QUANTITIES)}{retained}"
+        return f"{absent[0]}: no message on {self._name_topics(absent[0])}" if absent else None
 
     @property
     def silence_reason(self) -> str:
         """Reason why no messages arrive any more, with the setting that may help."""
-        return f"no new message on {', '.join(dict.fromkeys(self._find_topics(*REQUIRED_QUANTITIES)))}{self._hint}"
+        return f"no new message on {self._name_topics(*REQUIRED_QUANTITIES)}{self._hint}"
 
     @property
     def _hint(self) -> str:
@@ -304,7 +304,7 @@ class SampleAssembler:
         """Count a sample that lacks voltage or current."""
         self._counters["stale"] += 1
         if (name, 0, 1) in self._values:
-            topics = ", ".join(self._find_topics(name))
+            topics = self._name_topics(name)
             self.faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.stale_s:g} s{self._hint}")
 
     def _value(self, name: str, now_s: float) -> float | None:
@@ -327,8 +327,12 @@ class SampleAssembler:
         slots = [self._values.get(key) for key in keys]
         return [slot.value if slot and self._is_fresh(slot, now_s) else math.nan for slot in slots]
 
-    def _find_topics(self, *quantities: str) -> list[str]:
-        return [binding.topic for binding in self._bindings if binding.quantity in quantities]
+    def _name_topics(self, *quantities: str) -> str:
+        """Return the first topic of each quantity, and the number of the others."""
+        topics = [[binding.topic for binding in self._bindings if binding.quantity == name] for name in quantities]
+        first = dict.fromkeys(each[0] for each in topics)
+        others = len({topic for each in topics for topic in each} - set(first))
+        return ", ".join(first) + (f" and {others} other topics" if others else "")
 
 
 def _read(binding: _TopicBinding, payload: bytes, number: int | None) -> Mapping[int, float]:

@@ -388,6 +388,13 @@ def test_the_reason_for_missing_messages_names_the_setting_of_a_publisher_of_cha
     )
 
 
+def test_the_reason_for_missing_messages_names_one_topic_of_each_quantity() -> None:
+    assembler = SampleAssembler(source(profile="esphome-jk", prefix="jk"))
+    assert assembler.fault == (
+        "no message on jk/sensor/jk_total_voltage/state, jk/sensor/jk_current/state and 4 other topics"
+    )
+
+
 def test_retained_values_are_ignored_but_a_retained_availability_is_reported() -> None:
     assembler = SampleAssembler(json_source(availability_topic="home/status"))
     assert feed(assembler, [("home/pack", '{"u": 52, "i": 1}')], retained=True) == []

@@ -166,7 +166,7 @@ class _RowParser:
                 self.pending_error = UserError(f"{self._path}: {text}")
                 self.cut_line = f"{text}: the last row is cut off, and not used"
             else:
-                rows.append(self._row(cells, number))
+                rows.append([self._value(*each, cells, number) for each in self._columns.items()])
         return dict(zip(self._columns, np.array(rows).T, strict=True)) if rows else {}
 
     def _has_no_value(self, cells: Sequence[str]) -> bool:
@@ -180,9 +180,6 @@ class _RowParser:
                     continue
                 return False
         return True
-
-    def _row(self, cells: Sequence[str], line: int) -> list[float]:
-        return [self._value(role, column, cells, line) for role, column in self._columns.items()]
 
     def _value(self, role: ColumnRole, column: Column, cells: Sequence[str], line: int) -> float:
         cell = cells[column.index]
