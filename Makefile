@@ -173,6 +173,7 @@ addon: venv ## a repository with the Home Assistant add-on in build/addon, for a
 	rm -rf build/addon && mkdir -p build/addon && cp deploy/home-assistant/repository.yaml build/addon
 	cp -r deploy/home-assistant/addon build/addon/bms_estimator
 	$(BIN)/python -m hatchling build --target wheel --directory build/addon/bms_estimator
+	version=$$($(BIN)/python -m hatchling version) && sed -i "s/@VERSION@/$${version%+*}/" build/addon/bms_estimator/config.yaml # a tag of Docker has no +
 
 docs: venv ## the documentation as a site in build/site, with checked links
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -77,12 +77,13 @@ def build(output: Path, compression: str, architecture: str) -> Path:
     link = root / "usr/bin/bms-estimator"
     link.parent.mkdir()
     link.symlink_to(f"..{ENVIRONMENT.as_posix().removeprefix('/usr')}/bin/bms-estimator")
-    write_documents(root / "usr/share/doc/bms-estimator", program.version)
-    write_control(root / "DEBIAN", program.version, architecture, size_kib(root))
+    version = program.version.replace(".dev", "~dev")  # Debian orders 0.1.0~dev1 before 0.1.0, but 0.1.0.dev1 behind it
+    write_documents(root / "usr/share/doc/bms-estimator", version)
+    write_control(root / "DEBIAN", version, architecture, size_kib(root))
     subprocess.run(["chmod", "-R", "u=rwX,go=rX", root], check=True)
     for library in site_packages.rglob("*.so*"):  # libraries of a Debian package are not executable
         library.chmod(0o644)
-    package = output / f"bms-estimator_{program.version}_{architecture}.deb"
+    package = output / f"bms-estimator_{version}_{architecture}.deb"
     subprocess.run(["dpkg-deb", "--root-owner-group", f"-Z{compression}", "--build", root, package], check=True)
     return package
 

@@ -9,8 +9,6 @@ import pytest
 
 from bms_estimator.installation.install import FILES
 
-DEPLOY = Path(__file__).parents[2] / "deploy"
-
 
 @pytest.fixture
 def find_program() -> Callable[[str], str]:
@@ -31,7 +29,7 @@ def find_program() -> Callable[[str], str]:
 @pytest.fixture
 def deploy() -> Path:
     """Return the folder with the files to deploy."""
-    return DEPLOY
+    return Path(__file__).parents[2] / "deploy"
 
 
 @pytest.fixture

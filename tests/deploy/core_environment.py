@@ -46,10 +46,10 @@ def make_core_environment(folder: Path) -> Path:
     return packages
 
 
-def build_wheel(folder: Path) -> Path:
-    """Build the wheel in ``folder`` and return its path."""
+def build_wheel(folder: Path, project: Path = PROJECT) -> Path:
+    """Build the wheel of ``project`` in ``folder`` and return its path."""
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder]
-    subprocess.run(command, cwd=PROJECT, check=True, capture_output=True)
+    subprocess.run(command, cwd=project, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
     return wheel
 

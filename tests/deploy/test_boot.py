@@ -6,13 +6,13 @@ import re
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.deploy.boot import PROJECT, SECRET, boot, make_root
+from tests.deploy.built_version import versions
 from tests.deploy.kernel_cache import OMITTED
 from tests.patience import LONG_S
 
@@ -38,8 +38,8 @@ def report(tmp_path_factory) -> dict[str, str]:
         if shutil.which(name, path="/usr/bin:/usr/sbin") is None:
             pytest.skip(f"{name} is not installed (apt install mosquitto mosquitto-clients)")
     packages = tmp_path_factory.mktemp("packages")
-    build_package(PROJECT, packages / "current")
-    build_package(copy_with_next_version(packages / "project"), packages / "next")
+    build_package(packages / "current", {})
+    build_package(packages / "next", {"SETUPTOOLS_SCM_PRETEND_VERSION": NEXT_VERSION})
     root = tmp_path_factory.mktemp("boot") / "root"
     make_root(root)
     text = boot(root, packages, systemd_nspawn, BOOT_S)
@@ -49,30 +49,13 @@ def report(tmp_path_factory) -> dict[str, str]:
     return dict(re.findall(r"(?ms)^== (\w+)\n(.*?)(?=^== |\Z)", text))
 
 
-def build_package(project: Path, folder: Path) -> None:
-    """Build the wheel and the Debian package of a checkout in ``folder``, without compression, which would take minutes."""
+def build_package(folder: Path, variables: dict[str, str]) -> None:
+    """Build the wheel and the Debian package in ``folder``, without compression, which would take minutes."""
     if shutil.which("dpkg-deb") is None or not Path("/usr/bin", PYTHON).exists():
         pytest.skip(f"dpkg-deb or /usr/bin/{PYTHON} is missing, as on a distribution other than Debian")
-    command = [sys.executable, project / "deploy/debian/build.py", folder, "--compression", "none"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, PROJECT / "deploy/debian/build.py", folder, "--compression", "none"]
+    done = subprocess.run(command, env=os.environ | variables, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def version_of(project: Path) -> str:
-    """Return the version of a checkout."""
-    return tomllib.loads((project / "pyproject.toml").read_text())["project"]["version"]
-
-
-def copy_with_next_version(folder: Path) -> Path:
-    """Create a checkout that differs from this one only in the version, from links to this one's files. Return ``folder``."""
-    folder.mkdir()
-    for path in PROJECT.iterdir():
-        (folder / path.name).symlink_to(path)
-    settings = folder / "pyproject.toml"
-    text = settings.read_text()
-    settings.unlink()
-    settings.write_text(text.replace(f'version = "{version_of(PROJECT)}"', f'version = "{NEXT_VERSION}"', 1))
-    return folder
 
 
 def test_package_is_not_started_without_settings(report):
@@ -157,9 +140,10 @@ def test_service_stops_cleanly(report):
 @pytest.mark.parametrize("installer", ["deb", "pip"])
 def test_upgrade_to_another_version_restarts_the_running_services_with_it(report, installer):
     before, after = report[f"{installer}_before"], report[f"{installer}_after"]
-    assert f"bms-estimator {version_of(PROJECT)}\n" in before, report
+    (version,) = versions(PROJECT, "version")
+    assert f"bms-estimator {version}\n" in before, report
     assert f"bms-estimator {NEXT_VERSION}\n" in after, report
-    assert messages(before)["info"]["version"] == version_of(PROJECT)
+    assert messages(before)["info"]["version"] == version
     assert messages(after)["info"]["version"] == NEXT_VERSION
     assert "never true" not in report[installer]
     assert "ActiveState=active" in report[installer]

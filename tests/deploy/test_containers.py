@@ -16,7 +16,6 @@ import aiohttp
 import pytest
 
 from bms_estimator.settings.pack import load_settings
-from bms_estimator.version import __version__
 from tests.command_line import PROGRAM
 from tests.free_port import free_port
 from tests.patience import LONG_S
@@ -142,11 +141,6 @@ def test_the_pages_work_below_any_path(static):
     assert not [
         link for text in texts for link in re.findall(r'(?:href|src|action)="/|(?:fetch|EventSource)\([`"]/', text)
     ]
-
-
-def test_addon_has_the_version_of_the_program(deploy):
-    config = (deploy / "home-assistant/addon/config.yaml").read_text()
-    assert re.search(r'(?m)^version: "(.*)"$', config)[1] == __version__
 
 
 @pytest.mark.parametrize("file", ["docker/Dockerfile", "home-assistant/addon/Dockerfile"])

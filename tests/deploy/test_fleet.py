@@ -1,7 +1,6 @@
 """Units of the fleet, checked by systemd, and generated configurations of three nodes."""
 
 import re
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ from bms_estimator.fleet.server.nats_config import Accounts, configuration
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_of
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.settings.fleet import FleetSettings
-from tests.deploy.test_unit import MAX_EXPOSURE, verify
+from tests.deploy.test_unit import MAX_EXPOSURE, exposure, verify
 
 FindProgram = Callable[[str, str], str]
 NODES = "a.example,b.example,c.example"
@@ -40,11 +39,7 @@ def test_systemd_reports_no_error_in_the_units(find_program: FindProgram, unit: 
 
 
 def test_exposure_is_at_most_1_5(find_program: FindProgram, unit: Path) -> None:
-    command = [find_program("systemd-analyze", "systemd"), "security", "--offline=true", "--no-pager", unit]
-    text = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    exposure = re.search(r"Overall exposure level for \S+: ([0-9.]+)", text)
-    assert exposure, text
-    assert float(exposure[1]) <= MAX_EXPOSURE
+    assert exposure(find_program("systemd-analyze", "systemd"), unit) <= MAX_EXPOSURE
 
 
 def test_memory_of_ingest_is_limited(deploy: Path) -> None:

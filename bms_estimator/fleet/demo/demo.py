@@ -265,8 +265,8 @@ async def _send_faulty_blocks(
     )
     weak = await processes.poll(lambda: faulty_packs.ask_weak_cell(processes, demo.folder / _HOURS))
     demo.report(
-        f"   {weak['pack']}    sends the voltages of its 14 cells. `fleet ask weak-cells` names cell {weak['cell']}:\n"
-        f"                its SOC is {-100.0 * weak['soc_deviation']:.0f} % below the mean of the cells."
+        f"   {weak['pack']}    sends the voltages of its 14 cells. `fleet ask failing` names cell {weak['cell']}:\n"
+        f"                its SOC is {-100.0 * weak['value']:.0f} % below the mean of the cells."
     )
 
 

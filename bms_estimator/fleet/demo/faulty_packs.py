@@ -58,7 +58,7 @@ async def read_dead_letter(nc: Client) -> DeadLetter | None:
 
 
 async def ask_weak_cell(processes: Processes, folder: Path) -> dict[str, Any]:
-    """Return the row of ``WEAK_CELL`` in the answer to the query ``weak-cells``, as soon as an hour of it is on disk.
+    """Return the row of ``WEAK_CELL`` in the answer to the query ``failing``, as soon as an hour of it is on disk.
 
     The query runs in a process of its own, because DuckDB reports leaks at the end of a process that also uses numba.
 
@@ -68,8 +68,8 @@ async def ask_weak_cell(processes: Processes, folder: Path) -> dict[str, Any]:
     """
 
     async def read() -> dict[str, Any] | None:
-        answer = await processes.output("ask", "weak-cells", "--folder", folder, "--json")
-        return next((row for row in json.loads(answer or "[]") if row["pack"] == WEAK_CELL), None)
+        answer = await processes.output("ask", "failing", "--folder", folder, "--json")
+        return next((row for row in json.loads(answer or "[]") if (row["pack"], row["quantity"]) == (WEAK_CELL, "cell SOC")), None)
 
     await processes.until(lambda: any(folder.glob("date=*/*.parquet")))
     return await processes.poll(read)

@@ -89,14 +89,13 @@ async def ingesting(folder: Path, url: str, **more: Any) -> AsyncIterator[None]:
 
 def select(folder: Path, query: str) -> list[int]:
     """Return a column of the stored blocks' database; an empty list without a readable database."""
-    path = folder / "blocks" / FILE
-    with contextlib.suppress(sqlite3.DatabaseError), contextlib.closing(_read_only(path)) as database:
+    address = f"file:{folder / 'blocks' / FILE}?mode=ro"
+    with (
+        contextlib.suppress(sqlite3.DatabaseError),
+        contextlib.closing(sqlite3.connect(address, uri=True)) as database,
+    ):
         return [value for (value,) in database.execute(query)]
     return []
-
-
-def _read_only(path: Path) -> sqlite3.Connection:
-    return sqlite3.connect(f"file:{path}?mode=ro", uri=True)
 
 
 async def until_stored(folder: Path, blocks: int) -> None:

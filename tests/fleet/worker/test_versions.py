@@ -3,6 +3,7 @@
 import asyncio
 import sys
 import time
+import zipfile
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.partition import Partition
 from tests.command_line import PROGRAM, running_program
+from tests.deploy.built_version import link_project, versions
+from tests.deploy.core_environment import build_wheel
 from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.partition_stream import estimates_of
 from tests.fleet.worker import later_version
@@ -137,6 +140,23 @@ async def test_states_survive_a_rolling_upgrade_and_a_roll_back_while_blocks_arr
     assert await old.end() == 0
     partitions = await assert_bit_identical(nc, registry, 5)
     assert all(each.counters[UPGRADED] and each.counters[DOWNGRADED] for each in partitions)
+
+
+async def test_status_shows_the_builds_of_workers_by_their_commits(nc, heartbeats, workers, cluster, tmp_path) -> None:
+    project, by_worker = link_project(tmp_path / "project"), {}
+    for name in ("old", "new"):
+        (by_worker[name],) = versions(project, "commit; version")
+        build = tmp_path / name
+        with zipfile.ZipFile(build_wheel(build, project)) as wheel:
+            wheel.extractall(build)
+        program = ("env", f"PYTHONPATH={build}", sys.executable, PROGRAM)
+        workers.stack.callback(Process(tmp_path, cluster.url, name, program=program).kill)
+    await heartbeats.until_held(PARTITIONS, *by_worker)
+    async with running_program(PROGRAM, "fleet", "status", "--server", cluster.url) as process:
+        out, _ = await process.communicate()
+    rows = [line.split()[:2] for line in out.decode().splitlines()]
+    assert [row for row in rows if row and row[0] in by_worker] == [[name, by_worker[name]] for name in ("new", "old")]
+    assert by_worker["new"] != by_worker["old"]
 
 
 @pytest.mark.thorough

@@ -3,7 +3,6 @@
 More tests of the check are in ``test_pinned_board``.
 """
 
-import asyncio
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,6 +20,7 @@ from bms_estimator.sources.serial import port_list
 from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.patience import until
 from tests.serial_line import Line, usb_port
+from tests.sources.serial.test_serial_source import run_tasks, store_blocks
 
 ASH_RESET = b"\x1a\xc1\x02\x0b\x0a\x52\x7e"
 """Bytes that a Zigbee stick sends after its reset."""
@@ -29,18 +29,8 @@ ASH_RESET = b"\x1a\xc1\x02\x0b\x0a\x52\x7e"
 @contextlib.asynccontextmanager
 async def run_source(source: SerialSource, blocks: list[SampleBlock]):
     """Run the source. Append its blocks to ``blocks``."""
-
-    async def store_blocks() -> None:
-        async for block, *_ in source:
-            blocks.append(block.copy())
-
-    async with source:
-        task = asyncio.create_task(store_blocks())
-        try:
-            yield
-        finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+    async with source, run_tasks(store_blocks(source, blocks)):
+        yield
 
 
 async def test_nothing_is_sent_to_a_device_that_is_silent_or_has_another_protocol(line: Line) -> None:
@@ -94,12 +84,8 @@ async def plugged_in(path: Path, serial: int, voltage_v: float = 22.2):
     """Run a board that is plugged in at ``path``."""
     reading = Reading(current_a=0.5, voltage_v=voltage_v, temperature_c=25.0)
     with VirtualBoard(lambda _: reading, serial=serial) as board, symlink(path, board.path):
-        task = asyncio.create_task(board.run())
-        try:
+        async with run_tasks(board.run()):
             yield
-        finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_auto_rejects_another_board_and_reopens_its_own(only_port: Path) -> None:
@@ -127,7 +113,5 @@ async def test_auto_reports_a_board_that_prints_text_in_place_of_its_own(only_po
             await until(lambda: source.board_check.serial)
         await until(lambda: source.silence_reason)
         with VirtualBoard(lambda _: Reading(0.5, 22.2), mode="text") as other, symlink(only_port, other.path):
-            task = asyncio.create_task(other.run())
-            await until(lambda: source.silence_reason and "prints text" in source.silence_reason)
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
+            async with run_tasks(other.run()):
+                await until(lambda: source.silence_reason and "prints text" in source.silence_reason)
