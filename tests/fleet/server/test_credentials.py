@@ -317,7 +317,7 @@ async def test_reader_reads_everything_and_cannot_write(fleet: Fleet) -> None:
         hours = await js.pull_subscribe(subjects.hours(), "collector", stream=subjects.HOURS_STREAM)
         assert (await hours.consumer_info()).name == "collector"
         live = await nc.subscribe(subjects.hours())  # as the fleet page does
-        await nc.flush()
+        await js.stream_info(subjects.RAW_STREAM)  # sent after the subscription, unlike the ping of a flush
         await worker.publish(subjects.hours("p1"), b"row")
         assert (await live.next_msg(LONG_S)).data == b"row"
         assert rejections == []

@@ -44,6 +44,8 @@ KILLS, NODES, PACKS, SEED = (
 PARTITIONS = 4
 BLOCKS_PER_S = 40.0
 """Rate of the blocks of all edges, at which eight edges send an hour in 12 s [1/s]."""
+AGE_DAYS = 10
+"""Age of the edges' stores. The clocks of the edges reach the present after 48 min if eight edges send at ``BLOCKS_PER_S``."""
 MEAN_UPTIME_S = 1.0
 """Mean time from the restart after a kill to the next kill [s]."""
 MAX_DOWNTIME_S = 2.0
@@ -59,7 +61,7 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
     with running(tmp_path, NODES, partitions=PARTITIONS) as cluster, ExitStack() as stack:
         nc = await connected(cluster.urls)
         await make_streams(nc, partitions=PARTITIONS, replicas=NODES)
-        fleet = SimulatedFleet(PACKS, seed=SEED, begin_ns=time.time_ns() - 86_400 * 10**9)  # the packs are fast
+        fleet = SimulatedFleet(PACKS, seed=SEED, begin_ns=time.time_ns() - AGE_DAYS * 86_400 * 10**9)
         await write_bucket(nc, subjects.PACKS_BUCKET, pack_rows(fleet, tmp_path / "packs.csv"))
         bucket = await read_bucket(nc)
         workers, names = dict[str, Process](), (f"w{number}" for number in itertools.count(1))
