@@ -3,12 +3,9 @@
 import importlib.metadata
 import json
 import re
-import subprocess
-import sys
 import zipfile
-from pathlib import Path
 
-PROJECT = Path(__file__).parents[2]
+from tests.deploy.core_environment import PROJECT, build_wheel
 
 
 def runtime_dependencies(requirements: list[str], found: set[str]) -> set[str]:
@@ -22,10 +19,7 @@ def runtime_dependencies(requirements: list[str], found: set[str]) -> set[str]:
 
 
 def test_wheel_lists_its_dependencies_as_locked(tmp_path):
-    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path]
-    subprocess.run(command, cwd=PROJECT, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
+    with zipfile.ZipFile(build_wheel(tmp_path)) as archive:
         (name,) = (name for name in archive.namelist() if ".dist-info/sboms/" in name)
         bom = json.loads(archive.read(name))
         (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
