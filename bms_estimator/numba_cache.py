@@ -73,8 +73,10 @@ COMPILED_IN = (
     ),
 )
 """Files whose content is compiled into kernels: kernels, frame decoding and their constants."""
-# before numba chooses the target of the first kernel; the features of this machine's CPU would be added to the generic one
-numba.config.CPU_NAME, numba.config.CPU_FEATURES = "generic", ""  # type: ignore[attr-defined]
+# Before numba chooses the target of the first kernel. It reads its settings again when such a variable has changed. Without
+# the empty list of features, it would add those of this machine's CPU.
+os.environ |= {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
+numba.config.reload_config()  # type: ignore[no-untyped-call]
 
 
 def njit(*, cache: bool = False, **options: Any) -> Callable[[Function], Function]:
@@ -159,10 +161,11 @@ class _KernelCache(NullCache):
         name = (
             f"{source.stem}.{function.__qualname__}-{code.co_firstlineno}.py{sys.version_info[0]}{sys.version_info[1]}"
         )
-        if source.is_relative_to(_PACKAGE):
-            self._path = source.parent.relative_to(_PACKAGE) / name
-        else:
-            self._path = Path("outside") / hashlib.sha256(source.read_bytes()).hexdigest()[:16] / name
+        self._path = (
+            source.parent.relative_to(_PACKAGE)
+            if source.is_relative_to(_PACKAGE)
+            else Path("outside", hashlib.sha256(source.read_bytes()).hexdigest()[:16])
+        ) / name
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return the compiled kernel; None if it must be compiled."""

@@ -151,7 +151,7 @@ def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> No
     """
     series, ocv = p["series"], cell.ocv
     slope_v = np.interp(SOC_GRID, np.linspace(0.0, 1.0, p["ocv_slope_v"].size), p["ocv_slope_v"])
-    radians = np.abs(np.gradient(np.arctan(slope_v / (KNEE_V * series)), SOC_GRID))
+    radians = np.abs(np.gradient([math.atan(slope / (KNEE_V * series)) for slope in slope_v], SOC_GRID))
     p["curve_soc"] = 1.0 / (1.0 / CURVE_SOC + KNEE_DECORRELATION * radians)
     slope_v = np.minimum(slope_v, MAX_SLOPE_V * series)
     p["curve_error_v"] = np.sqrt((CURVE_ERROR_V * series) ** 2 + (CURVE_ERROR_SOC * slope_v) ** 2)
@@ -216,13 +216,13 @@ def ladder_of_branches(cell: CellModel) -> NDArray[np.float64]:
     of ln tau.
     """
     ohm, a = np.zeros((GRID, RESISTANCES)), cell.a
-    ln_taus = np.log(TAU_S)
+    ln_taus = [math.log(tau_s) for tau_s in TAU_S]
     for i, soc in enumerate(SOC_GRID):
         ohm[i, 0] = chen_mora.r_s(soc, a)
         c_ts = max(chen_mora.c_ts(soc, a), MIN_CAPACITANCE * a[9])
         c_tl = max(chen_mora.c_tl(soc, a), MIN_CAPACITANCE * a[12])
         for r, c in ((chen_mora.r_ts(soc, a), c_ts), (chen_mora.r_tl(soc, a), c_tl)):
-            position = float(np.interp(np.log(r * c), ln_taus, np.arange(BRANCHES)))
+            position = float(np.interp(math.log(min(max(r * c, TAU_S[0]), TAU_S[-1])), ln_taus, np.arange(BRANCHES)))
             k = min(int(position), BRANCHES - 2)
             ohm[i, 1 + k] += r * (k + 1 - position)
             ohm[i, 2 + k] += r * (position - k)

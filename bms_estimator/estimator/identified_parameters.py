@@ -16,6 +16,7 @@ from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION, node_error_scale, node_position
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
+from bms_estimator.model.arrays import exp
 from bms_estimator.model.cell import CellModel, TableOcv
 
 MAX_CAPACITY_STD = 0.3
@@ -126,7 +127,7 @@ def _state_and_std(record: np.void, j: int) -> tuple[float, float]:
     n = f["count"]
     if n == 1:  # the usual case, which is cheaper
         return float(f["mean"][0, j]), math.sqrt(f["covariance"][0, j, j])
-    weight = np.exp(f["ln_weight"][:n] - f["ln_weight"][f["best"]])
+    weight = exp(f["ln_weight"][:n] - f["ln_weight"][f["best"]])
     weight /= weight.sum()
     values, variances = f["mean"][:n, j], f["covariance"][:n, j, j]
     mean = float(weight @ values)

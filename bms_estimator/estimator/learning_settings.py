@@ -1,5 +1,7 @@
 """Settings record of the learning law from typed settings."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -51,7 +53,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, observer_reco
         q["lower"][j], q["upper"][j] = _bounds(cell, SCALED_INDICES[name])
     # tau_ts must stay below the geometric mean of both time constants, and tau_tl above it; 0, the value of the file, is
     # allowed even if the file has them in the reverse order
-    ln_to_mean = max(0.5 * np.log(a[6] * a[12] / (a[3] * a[9])), 0.0)
+    ln_to_mean = max(0.5 * math.log(a[6] * a[12] / (a[3] * a[9])), 0.0)
     q["upper"][TAU_TS], q["lower"][TAU_TL] = min(q["upper"][TAU_TS], ln_to_mean), max(q["lower"][TAU_TL], -ln_to_mean)
     q["middle"] = 0.5 * (q["lower"] + q["upper"])
     error_v = float(observer_record["epsilon_v"])
@@ -67,6 +69,6 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, observer_reco
 def _bounds(cell: CellModel, scaled: tuple[int, ...]) -> tuple[float, float]:
     """Return the bounds of an element of theta by the bounds of its ``scaled`` parameters. 0, the file's value, is included."""
     bounds = [(cell.bounds(i), cell.a[i]) for i in scaled]
-    lower = max(np.log(b.lower / value) for b, value in bounds)
-    upper = min(np.log(b.upper / value) for b, value in bounds)
+    lower = max(math.log(b.lower / value) for b, value in bounds)
+    upper = min(math.log(b.upper / value) for b, value in bounds)
     return min(lower, 0.0), max(upper, 0.0)

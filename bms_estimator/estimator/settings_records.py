@@ -20,6 +20,7 @@ from bms_estimator.kernels.observer.mittag_leffler import decay_table, series_co
 from bms_estimator.kernels.observer.nussbaum import Nussbaum
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
+from bms_estimator.model.arrays import exp
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.monotone_cubic import MonotoneCubic
@@ -95,7 +96,7 @@ def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     soc = np.linspace(0.0, 1.0, OCV_POINTS)
     if isinstance(cell.ocv, ChenMoraOcv):
         a = cell.a
-        slope = a[16] * a[17] * np.exp(-a[17] * soc) + a[19] - 2.0 * a[20] * soc + 3.0 * a[21] * soc**2
+        slope = a[16] * a[17] * exp(-a[17] * soc) + a[19] - 2.0 * a[20] * soc + 3.0 * a[21] * soc**2
         return np.array([emf(x, a) for x in soc]), slope
     curve = MonotoneCubic(cell.ocv.soc, cell.ocv.ocv_v)
     return curve(soc), curve.derivative(soc)

@@ -5,6 +5,8 @@ single cells limit them. Each cell has a share of a limit of the pack's voltage:
 equal one cell reaches the limit when this cell reaches its share.
 """
 
+import math
+
 import numpy as np
 
 from bms_estimator.estimator import Estimator
@@ -53,8 +55,8 @@ def state_of_cell(state: Records, cells: CellDeviations, i: int) -> Records:
     mean, covariance = shifted["mean"][0], shifted["covariance"][0]
     mean[:, SOC] += cells.soc_deviation[i]
     covariance[:, SOC, SOC] += cells.soc_deviation_std[i] ** 2
-    mean[:, [LN_R0, LN_R]] += np.log(cells.resistance_ratio[i])
-    mean[:, LN_Q] += np.log(cells.capacity_ratio[i])
+    mean[:, [LN_R0, LN_R]] += math.log(cells.resistance_ratio[i])
+    mean[:, LN_Q] += math.log(cells.capacity_ratio[i])
     return shifted
 
 

@@ -1,5 +1,6 @@
 """Array and record types of kernels and their callers."""
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -12,6 +13,11 @@ Record = Any
 """Element of a structured array in a kernel. Its type is Any, because only numba resolves its fields."""
 Records = NDArray[np.void]
 """Structured array."""
+
+
+def exp(exponents: Floats) -> Floats:
+    """Return e^x of each value by the C library, as kernels compute it. The last bit of ``np.exp`` depends on the CPU."""
+    return np.array([math.exp(x) for x in exponents.flat]).reshape(exponents.shape)
 
 
 def structured_array(columns: Mapping[str, Floats]) -> Records:

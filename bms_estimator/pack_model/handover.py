@@ -4,6 +4,8 @@ The fitted curves replace those in the filter's settings. SOC, capacity and offs
 those in the filter's state.
 """
 
+import math
+
 import numpy as np
 
 from bms_estimator.estimator import Estimator
@@ -12,7 +14,7 @@ from bms_estimator.estimator.fitted_state import FittedState
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, exp
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
 from bms_estimator.pack_model.fit import CURVE as FIT_CURVE
 from bms_estimator.pack_model.fit import LN_Q as FIT_LN_Q
@@ -76,7 +78,7 @@ def _adopt_ocv(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
 def _adopt_resistances(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
     """Write the fitted resistances and their std."""
     for name in ("weak_ohm", "strong_ohm"):
-        settings[name] = file_settings[name] * np.exp(fit.ln_r)[:, RESISTANCE_GROUPS]
+        settings[name] = file_settings[name] * exp(fit.ln_r)[:, RESISTANCE_GROUPS]
     middle = SOC_GRID.size // 2
     settings["middle_ohm"] = settings["weak_ohm"][middle].sum() + settings["strong_ohm"][middle].sum()
     settings["r_std"] = r_std(fit)
@@ -108,7 +110,7 @@ def adopt_state(estimator: Estimator, fit: PackFit) -> None:
     After a gap since the fit's last row each hypothesis of the filter keeps its SOC.
     """
     h, p = estimator.record[0]["history"], estimator.settings_record[0]["filter"]
-    drawn_soc = (h["charge_as"] - fit.charge_as) / p["capacity_as"] * np.exp(-fit.mean[FIT_LN_Q])
+    drawn_soc = (h["charge_as"] - fit.charge_as) / p["capacity_as"] * math.exp(-fit.mean[FIT_LN_Q])
     estimator.adopt(
         FittedState(
             soc=fit.mean[FIT_SOC] - drawn_soc if h["segment"] == fit.segment else None,

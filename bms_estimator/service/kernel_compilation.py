@@ -8,10 +8,10 @@ recorded order, one after the other, and write them to the cache of ``numba_cach
 import contextlib
 import importlib
 import os
-import queue
 import subprocess
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
@@ -82,9 +82,7 @@ def compile_kernels(report: Callable[[Progress], None] = lambda _: None) -> None
     if CACHE_FOLDER is None or is_compiled():
         return
     order = compile_order()
-    pending, done = queue.SimpleQueue[Kernel](), list[Kernel]()
-    for kernel in order:
-        pending.put(kernel)
+    pending, done = deque(order), list[Kernel]()
     count = max(1, min(len(os.sched_getaffinity(0)), available_bytes() // CHILD_BYTES))
     compilers = [_Compiler(pending, done) for _ in range(count)]
     try:
@@ -108,7 +106,7 @@ def compile_kernels(report: Callable[[Progress], None] = lambda _: None) -> None
 class _Compiler(threading.Thread):
     """Thread that passes kernels to one child after the other."""
 
-    def __init__(self, pending: "queue.SimpleQueue[Kernel]", done: list[Kernel]) -> None:
+    def __init__(self, pending: deque[Kernel], done: list[Kernel]) -> None:
         super().__init__(daemon=True)
         self._pending, self._done = pending, done
         self._lock, self._stopped = threading.Lock(), False
@@ -124,7 +122,7 @@ class _Compiler(threading.Thread):
                 kernel = self._compile_in(child, kernel)
             failures = failures + 1 if len(self._done) == count else 0
         if kernel:
-            self._pending.put(kernel)
+            self._pending.append(kernel)
 
     def _compile_in(self, child: subprocess.Popen[str], kernel: Kernel | None) -> Kernel | None:
         """Compile kernels until the child ends or no kernel is pending; return the kernel that the child did not compile."""
@@ -141,8 +139,8 @@ class _Compiler(threading.Thread):
         return None
 
     def _next(self) -> Kernel | None:
-        with contextlib.suppress(queue.Empty):
-            return self._pending.get_nowait()
+        with contextlib.suppress(IndexError):
+            return self._pending.popleft()
         return None
 
     def _start_child(self) -> subprocess.Popen[str] | None:

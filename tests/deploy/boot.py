@@ -8,8 +8,6 @@ import uuid
 from importlib.metadata import distribution
 from pathlib import Path
 
-from tests.deploy import kernel_cache
-
 PROJECT = Path(__file__).parents[2]
 ROOT_LINKS = {"bin": "usr/bin", "sbin": "usr/sbin", "lib": "usr/lib", "lib64": "usr/lib64"}
 OWN_FOLDERS = ("etc/systemd/system", "etc/udev/rules.d", "root/bin", "root/house", "root/pip", "var/lib/dpkg")
@@ -125,9 +123,6 @@ def make_root(root: Path) -> None:
     state.mkdir()
     # a checkpoint of an earlier version, with the name that the service gives to those of this pack
     shutil.copy(PROJECT / "tests/checkpoint/checkpoint_format_7.npz", state / "pack-5613cbc0.npz")
-    kernel_cache.fill(root / "var/cache/bms-estimator")
-    kernel_cache.fill(root / "root/cache-of-copy", omitted=None)
-    shutil.copytree(root / "var/cache/bms-estimator", root / "root/cache")
 
 
 def write_program(path: Path, text: str) -> None:

@@ -44,7 +44,7 @@ upgrade() {
     until_true 'receive info | grep -q "\"version\": *\"$(bms-estimator --version | cut -d " " -f 2)\""'
     show
     grep -c "# edited" /etc/bms-estimator/pack.toml /etc/systemd/system/bms-estimator.service
-    lines | grep restored | tail -n 1
+    lines | grep "restored: SOC" | tail -n 1
     part "$1_after"
     snapshot
     kill $subscriber
@@ -61,7 +61,7 @@ systemd-run --quiet --unit=broker mosquitto -c /root/bms.conf
 cd /root/house && head -n 1 /root/install >/root/install-package && tail -n +2 /root/install >/root/install-service
 run_page /root/install-package
 # a simulated board, which prints the path of its line
-systemd-run --quiet --unit=board --setenv=NUMBA_CACHE_DIR=/root/cache sh -c \
+systemd-run --quiet --unit=board sh -c \
     'bms-estimator simulate --cell chen_mora --rate-hz 10 >/run/board'
 until_true 'grep -q /dev/pts/ /run/board'
 chgrp dialout "$(cat /run/board)" && chmod 660 "$(cat /run/board)" && mkdir /dev/bms && ln -s "$(cat /run/board)" /dev/bms/board
@@ -76,7 +76,7 @@ systemctl is-enabled bms-estimator
 systemctl show bms-estimator -p WatchdogUSec
 grep -E "^(Uid|NoNewPrivs|Seccomp|CapEff):" "/proc/$(main_pid)/status"
 tr '\0' '\n' <"/proc/$(main_pid)/environ" | grep BMS_BOOT_ID
-find $cache -name "step.run-*.nbc" -printf "cached %f\n"
+echo "compiled $(find $cache -name "*.nbc" | wc -l)"
 # in the mount namespace of the service
 nsenter -t "$(main_pid)" -m sh -c 'ls -A /home /root; touch /root/x /etc/x' 2>&1
 
@@ -89,7 +89,6 @@ ps -eo args | grep -v grep | grep -c "$secret"
 timeout 5 mosquitto_sub -C 2 -u dashboard -P two -t bms/pack/health -t bms/pack/info | grep -c "$secret"
 
 part watchdog
-for name in $(find $cache -name "*.nbc" | sort | head -n 1); do : >"$name"; done # as a power cut leaves it
 # by this file systemd-timesyncd reports a synchronized clock, which the restarted service must see
 mkdir -p /run/systemd/timesync && touch /run/systemd/timesync/synchronized
 # a stopped process does not notify the watchdog
@@ -138,7 +137,6 @@ traces
 
 # a program in a home folder, which the service cannot read there
 part home
-cp -a /root/cache-of-copy /var/cache/bms-estimator
 /root/program/bin/python3 /root/program/bin/bms-estimator install /root/house/pack.toml
 show
 systemctl show bms-estimator -p ExecStart

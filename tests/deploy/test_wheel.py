@@ -115,6 +115,12 @@ def test_replay_of_a_cell_with_an_ocv_table_needs_no_other_package(environment, 
     assert done.returncode == 0, done.stderr
 
 
+def test_generic_cell_is_converted_to_a_c_header(environment, tmp_path):
+    done = run(environment, tmp_path, "cell", "convert", "lfp", "--capacity-ah", "100", "--out", "cell.h")
+    assert done.returncode == 0, done.stderr
+    assert "#define" in (tmp_path / "cell.h").read_text()
+
+
 def test_a_command_that_fits_cells_names_its_extra(environment, tmp_path):
     done = run(environment, tmp_path, "identify", "log.csv", "--cell", "lfp")
     assert done.returncode == 2

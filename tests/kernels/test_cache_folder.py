@@ -158,7 +158,9 @@ def test_another_installation_of_the_same_version_loads_shipped_and_cached_kerne
         shutil.copytree(cached_kernel, tmp_path / "bms_estimator" / "compiled")
         cache = tmp_path / "empty"
     script = """
-import bms_estimator, numpy
+import os, numba, numpy
+os.environ["NUMBA_WARNINGS"] = "0"  # numba reads its settings again
+import bms_estimator
 from bms_estimator.protocols.firmware.framing import crc16
 print(bms_estimator.__file__, crc16(numpy.zeros(4, "u1"), 0, 4), sum(crc16.stats.cache_misses.values()))
 """

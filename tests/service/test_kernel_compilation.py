@@ -1,54 +1,44 @@
 """Compilation in child processes: the recorded order, the end of a child, and a child that fails."""
 
-import gc
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from numba.core import event
-from numba.core.dispatcher import Dispatcher
 
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.service import kernel_compilation
 from bms_estimator.service.kernel_compilation import (
     Progress,
-    argument_types,
-    compile_call,
     compile_kernels,
     compile_order,
     is_compiled,
 )
+
+FIRST_START = """
+import gc
+from numba.core import event
+from numba.core.dispatcher import Dispatcher
+from bms_estimator.service.kernel_compilation import argument_types, compile_call, compile_order
 from bms_estimator.service.kernel_warm_up import load_kernels
-
-
-class CompiledKernels(event.Listener):
-    """Listener that stores the names of the kernels that numba compiles."""
-
-    def __init__(self) -> None:
-        self.names: list[str] = []
-
-    def on_start(self, started: event.Event) -> None:
-        self.names.append(started.data["dispatcher"].py_func.__qualname__)
-
-    def on_end(self, _: event.Event) -> None:
-        pass
+load_kernels()
+gc.unfreeze()
+kernels = [each for each in gc.get_objects() if isinstance(each, Dispatcher) and each.py_func.__module__.startswith("bms_estimator.")]
+loaded = {(f"{each.py_func.__module__}.{each.py_func.__qualname__}", types) for each in kernels for types in each.signatures}
+names = argument_types()
+calls = [kernel.call.split(" ", 1) for kernel in compile_order()]
+recorded = {(f"bms_estimator.{name}", eval(types, names)) for name, types in calls}
+with event.install_recorder("numba:compile") as compiled:
+    for kernel in compile_order():
+        compile_call(kernel.call, names)
+print(bool(loaded), loaded - recorded, compiled.buffer)
+"""
+"""Program that prints kernels of a first start that the order lacks, and kernels of the order that a first start does not compile."""
 
 
 def test_the_recorded_order_is_that_of_this_version() -> None:
     """If it fails: ``make compile-order``."""
-    load_kernels()
-    compiled, names = CompiledKernels(), argument_types()
-    with event.install_listener("numba:compile", compiled):
-        for kernel in compile_order():
-            compile_call(kernel.call, names)
-    assert compiled.names == []
-    gc.unfreeze()
-    recorded = {kernel.call.split(" ")[0] for kernel in compile_order()}
-    functions = [each.py_func for each in gc.get_objects() if isinstance(each, Dispatcher) and each.signatures]
-    loaded = {f"{each.__module__}.{each.__qualname__}" for each in functions}
-    assert "bms_estimator.kernels.step.run" in loaded
-    order_of_step = {f"bms_estimator.{name}" for name in recorded if name.startswith("kernels.step.")}
-    assert order_of_step <= loaded
+    assert subprocess.check_output([sys.executable, "-c", FIRST_START], text=True) == "True set() []\n"
 
 
 @pytest.fixture

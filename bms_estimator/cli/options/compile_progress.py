@@ -3,9 +3,10 @@
 Only a first start compiles kernels, for half a minute on two idle cores. Later starts load them from the cache.
 """
 
-import sys
 from collections.abc import Callable
+from functools import partial
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
@@ -46,7 +47,7 @@ def compile_ahead(report: Callable[[str], object] | None = None) -> None:
         return
     console = Console(stderr=True)
     if not console.is_terminal:
-        (report or _to_stderr)(COMPILE_TEXT)
+        (report or partial(typer.echo, err=True))(COMPILE_TEXT)
     with new_bar(console) as bar:
         task = bar.add_task(COMPILE_LABEL, total=None)
 
@@ -55,8 +56,3 @@ def compile_ahead(report: Callable[[str], object] | None = None) -> None:
             bar.update(task, description=label, total=progress.all_cpu_s, completed=progress.cpu_s)
 
         compile_kernels(update)
-
-
-def _to_stderr(text: str) -> None:
-    sys.stderr.write(f"{text}\n")
-    sys.stderr.flush()

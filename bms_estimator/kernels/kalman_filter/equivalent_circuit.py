@@ -37,7 +37,7 @@ MAX_STEP_S = 2.0
 """Maximum time between two samples that show a current step [s]."""
 IDENTIFIED_FRACTION = 0.5
 """Fraction of its initial variance below which a scale of the resistances counts as identified."""
-LN_TAUS = np.log(np.array(TAU_S))
+LN_TAUS = np.array([math.log(tau_s) for tau_s in TAU_S])
 """Logarithms of the ladder's time constants in seconds."""
 
 EQUIVALENT = np.dtype(

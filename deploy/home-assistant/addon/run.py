@@ -120,10 +120,11 @@ async def answer_to(request: web.Request, answer: aiohttp.ClientResponse) -> web
     response.headers["Content-Security-Policy"] = policy.replace("frame-ancestors 'none'", "frame-ancestors 'self'")
     if answer.headers.get("Location", "").startswith("/"):
         response.headers["Location"] = request.headers.get("X-Ingress-Path", "") + answer.headers["Location"]
-    await response.prepare(request)
-    async for part in answer.content.iter_any():
-        await response.write(part)
-    await response.write_eof()
+    with contextlib.suppress(ConnectionResetError):  # the browser has left the page
+        await response.prepare(request)
+        async for part in answer.content.iter_any():
+            await response.write(part)
+        await response.write_eof()
     return response
 
 
