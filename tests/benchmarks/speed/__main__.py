@@ -4,14 +4,14 @@ import sys
 from itertools import chain
 
 from tests.benchmarks.fleet import partition
-from tests.benchmarks.speed import capture, cells, forecast, forecast_request, kernel, live, packs
+from tests.benchmarks.speed import capture, cells, forecast, kernel, live, packs
 from tests.benchmarks.table import show
 
 GROUPS = {  # each function yields the rows of the table
     "kernel": kernel.rows,
     "forecast": forecast.rows,
     "cells": cells.rows,
-    "forecast_request": forecast_request.rows,
+    "forecast_request": forecast.request_rows,
     "capture": capture.rows,
     "live": live.rows,
     "packs": packs.rows,
