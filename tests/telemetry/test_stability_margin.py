@@ -4,25 +4,38 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.estimator.estimator import TraceBlock, make_estimator
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.pack_model import load_model
+from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
+from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC
+from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC, make_state_payload, no_forecast
+from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 from tests.telemetry.alarm_captures import WALL_S, settings
-from tests.telemetry.published_state import published_state
 from tests.telemetry.test_parameters import CAPACITANCE_NAMES, file_with_ladder
 
 FIT_S = 120
 """Duration of a block: time between two fits of an element."""
 TRUE_LIMIT = max(delta(*TRUTH.a[[8, 9, 7]]), delta(*TRUTH.a[[11, 12, 10]]))
 """SOC below which a capacitance of the true cell is negative."""
+
+
+def published_state(estimator: Estimator, trace: TraceBlock) -> Estimate:
+    """Return the state that is published after a block whose estimates are ``trace``, the only one of the run."""
+    window = Window()
+    window.add(trace, 0.0)
+    summary = window.take()
+    assert summary is not None
+    left_ah = remaining_capacity_ah(estimator)
+    return make_state_payload(summary, left_ah, no_forecast("none"), {}, 0.0, ChargeEnergy(), None)
 
 
 @pytest.fixture(scope="module")

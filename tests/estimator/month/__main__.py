@@ -13,9 +13,9 @@ from pathlib import Path
 from tests.conftest import SHARED_DATA
 from tests.estimator.month import electrochemical, summary
 from tests.estimator.month.cases import CASES, Case
+from tests.estimator.month.groups import GROUPS, group_score, mean_bound, title
 from tests.estimator.month.packs import REAL_CAPTURES
-from tests.estimator.month.run import run
-from tests.estimator.month.table import header, line
+from tests.estimator.month.run import Day, run
 
 
 def main() -> None:
@@ -64,6 +64,29 @@ def chosen(cases: Iterable[Case], filters: list[str], data: Path) -> Iterable[Ca
             write(f"left out: {case.name}: {data} does not exist")
             continue
         yield case
+
+
+def header(days: int) -> str:
+    """Return the lines above the results of ``days`` days."""
+    columns = ["case", "seed", *(title(g) for g in GROUPS if g[0] <= days), "capacity / true"]
+    return f"RMSE / inside / std / score (lower bound of the std) [%]\n\n{row(columns)}\n{row(['---'] * len(columns))}"
+
+
+def line(case: Case, days: list[Day]) -> str:
+    """Return the results of a run."""
+    scores = [group_score(days, g) for g in GROUPS if g[0] <= case.days]
+    bounds = [100.0 * mean_bound(days, g) for g in GROUPS if g[0] <= case.days]
+    cells = [
+        f"{s.rmse:.1f} / {s.cover:.0f} / {s.std:.1f} / {s.score:.1f} ({b:.1f})" if s else "-"
+        for s, b in zip(scores, bounds, strict=True)
+    ]
+    last = days[-1]
+    return row([case.name, str(case.seed), *cells, f"{last.capacity_ratio:.3f} +- {last.capacity_std:.3f}"])
+
+
+def row(cells: list[str]) -> str:
+    """Return a row of a Markdown table."""
+    return f"| {' | '.join(cells)} |"
 
 
 main()
