@@ -5,10 +5,8 @@ gain. Numbers in parentheses are equations of the thesis.
 """
 
 import asyncio
-import contextlib
 import math
-import signal
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +14,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from tests.command_line import PROGRAM
+from tests.end_to_end.test_whole_way import run_program
 from tests.mosquitto import Broker, Listener
-from tests.patience import LONG_S
 from tests.serial_line import Line
 
 CELL = load_cell("chen_mora")
@@ -94,8 +91,7 @@ def algorithm_1(samples: list[tuple[float, float, float]]) -> Iterator[tuple[flo
         yield -math.log(a[9] / a[7]) / a[8], -math.log(a[12] / a[10]) / a[11], mittag_leffler(k)
 
 
-@contextlib.asynccontextmanager
-async def run_program(folder: Path, line: Line, broker: Broker) -> AsyncIterator[None]:
+def pack_file(folder: Path, line: Line, broker: Broker) -> Path:
     pack = folder / "pack.toml"
     pack.write_text(f"""
 [pack]
@@ -119,13 +115,7 @@ url = "{broker.url}"
 [state]
 folder = "{folder / "state"}"
 """)
-    process = await asyncio.create_subprocess_exec(str(PROGRAM), "run", str(pack), stdout=asyncio.subprocess.DEVNULL)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.send_signal(signal.SIGTERM)
-        assert await asyncio.wait_for(process.wait(), LONG_S) == 0
+    return pack
 
 
 async def state_after(listener: Listener, row: tuple[float, float, float]) -> Any:
@@ -144,7 +134,7 @@ async def test_published_delta_1_delta_2_and_n_follow_algorithm_1_from_the_recei
             line.write(format_line(samples[0]))
             await asyncio.sleep(REPEAT_S)
 
-    async with Listener(broker, "bms/#") as listener, run_program(tmp_path, line, broker):
+    async with Listener(broker, "bms/#") as listener, run_program(pack_file(tmp_path, line, broker)):
         repeating = asyncio.create_task(repeat_first_line())
         await state_after(listener, samples[0])
         repeating.cancel()

@@ -7,16 +7,10 @@ import pytest
 
 from tests.calibration.simulated_load import TRUTH
 from tests.calibration.simulated_relaxation import relaxation
+from tests.cli.cell.test_ocv import save
 from tests.command_line import run
 
 CAPACITY_AH = TRUTH.cell.capacity_ah
-
-
-def save(path, samples):
-    """Write samples to a CSV file. Return its path."""
-    rows = np.column_stack([samples[name] for name in ("time_s", "current_a", "voltage_v")])
-    np.savetxt(path, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
-    return path
 
 
 @pytest.fixture
