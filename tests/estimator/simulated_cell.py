@@ -1,5 +1,7 @@
 """Simulation of a cell with two RC pairs under random pulses, and cell files with wrong parameters."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from bms_estimator.estimator import Estimator
@@ -31,6 +33,18 @@ def wrong_cell(factor: float) -> CellModel:
             update={"amplitude_ohm": part.amplitude_ohm * factor, "offset_ohm": part.offset_ohm * factor}
         )
     return TRUTH.model_copy(update=parts)
+
+
+def run_divided(make: Callable[[], Estimator], block: SampleBlock) -> Estimator:
+    """Check that samples leave the same record at once, one by one and in parts. Return the estimator of all at once."""
+    at_once, stepped, in_parts = make(), make(), make()
+    at_once.run(block)
+    for time_s, current_a, voltage_v, temperature_c, *_, status in block.tolist():
+        stepped.step(time_s, current_a, voltage_v, status, temperature_c)
+    for part in np.array_split(block, 37):
+        in_parts.run(part)
+    assert at_once.record.tobytes() == stepped.record.tobytes() == in_parts.record.tobytes()
+    return at_once
 
 
 def pulses(soc: float = 1.0, hours: float = 3.0, seed: int = 1) -> tuple[SampleBlock, np.ndarray]:

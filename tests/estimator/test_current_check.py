@@ -8,7 +8,7 @@ from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
-from tests.estimator.simulated_cell import TRUTH, measured, pulses
+from tests.estimator.simulated_cell import TRUTH, measured, pulses, run_divided
 
 WRAPPED_A = {"0.1 A": 6553.6, "0.01 A": 655.36, "unsigned, offset 3000 A": 3556.5}
 """Current that a small charge of 3 A becomes when a signed number of 16 bits is read as an unsigned one, plus 3 A [A]."""
@@ -41,16 +41,10 @@ def test_doubtful_samples_leave_the_same_state_however_the_samples_are_divided()
     rng = np.random.default_rng(1)
     doubtful = rng.random(block.size) < 0.3
     block["current_a"][doubtful] = rng.choice([12.0, -12.0, 6.0, 65.53], int(doubtful.sum()))
-    in_one_block, stepped, in_blocks = (Estimator(TRUTH) for _ in range(3))
-    in_one_block.run(block)
-    for x in block:
-        stepped.step(*(float(x[name]) for name in ("time_s", "current_a", "voltage_v")), 0, float(x["temperature_c"]))
-    for part in np.array_split(block, 37):
-        in_blocks.run(part)
-    assert in_one_block.record.tobytes() == stepped.record.tobytes() == in_blocks.record.tobytes()
-    state = in_one_block.state[0]
+    estimator = run_divided(lambda: Estimator(TRUTH), block)
+    state = estimator.state[0]
     assert state["dropped_contradicted"] > 0
-    waiting = in_one_block.record[0]["current_check"]["waiting"]
+    waiting = estimator.record[0]["current_check"]["waiting"]
     assert (
         sum(state[name] for name in state.dtype.names if name.startswith("dropped_")) + state["samples"] + waiting
         == block.size

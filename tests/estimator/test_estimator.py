@@ -13,7 +13,7 @@ from bms_estimator.model.cell import load_cell, shipped_cells
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.settings.observer import ObserverSettings
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from tests.estimator.simulated_cell import pulses
+from tests.estimator.simulated_cell import pulses, run_divided
 
 CAPACITY_AS = 3.0 * 3600
 """Capacity of the cell ncr18650 [A s]."""
@@ -32,21 +32,13 @@ def noisy_load(n: int = 5000) -> SampleBlock:
     samples["voltage_v"] = 3.8 + rng.normal(0.0, 0.05, n)
     samples["voltage_v"][rng.integers(0, n, 20)] = np.nan
     samples["voltage_v"][rng.integers(0, n, 20)] = 0.0
-    samples["temperature_c"] = np.nan
+    for name in ("temperature_c", "temperature_min_c", "temperature_max_c"):
+        samples[name] = np.nan
     return samples
 
 
 def test_step_and_run_are_bit_identical_for_any_block_size() -> None:
-    samples = noisy_load()
-    in_one_block, stepped, in_blocks = (
-        Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None) for _ in range(3)
-    )
-    in_one_block.run(samples)
-    for x in samples:
-        stepped.step(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), int(x["status"]))
-    for part in np.array_split(samples, 37):
-        in_blocks.run(part)
-    assert in_one_block.state.tobytes() == stepped.state.tobytes() == in_blocks.state.tobytes()
+    run_divided(lambda: Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None), noisy_load())
 
 
 @pytest.mark.parametrize("series", [1, 4])

@@ -9,7 +9,6 @@ from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.cli.captures.replay_summary import Summary
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
-from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.fuel_cell import load_fuel_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.pack.pack import Pack
@@ -17,6 +16,7 @@ from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 from tests import mann_stack
+from tests.estimator.simulated_cell import run_divided
 
 PEM = load_fuel_cell("pem_30w")
 PARAMETERS = 16
@@ -61,18 +61,8 @@ def test_run_and_step_leave_the_same_state_to_the_last_bit(ten_minutes: mann_sta
     samples["voltage_v"][100] = np.nan
     samples["voltage_v"][200] = 25.0
     samples["temperature_c"][300:500] = np.nan
-    stepped, ran, in_parts = Estimator(PEM), Estimator(PEM), Estimator(PEM)
-    outcomes = [
-        stepped.step(*(float(s[n]) for n in ("time_s", "current_a", "voltage_v")), 0, float(s["temperature_c"]))
-        for s in samples
-    ]
-    ran.run(samples)
-    for part in np.array_split(samples, 7):
-        in_parts.run(part)
-    assert stepped.record.tobytes() == ran.record.tobytes() == in_parts.record.tobytes()
-    counts = {outcome: outcomes.count(outcome) for outcome in set(outcomes)}
-    assert counts == {SampleOutcome.ACCEPTED: 2998, SampleOutcome.NOT_FINITE: 1, SampleOutcome.OUT_OF_RANGE: 1}
-    assert ran.state["samples"][0] == 2998
+    state = run_divided(lambda: Estimator(PEM), samples).state[0]
+    assert (state["samples"], state["dropped_not_finite"], state["dropped_range"]) == (2998, 1, 1)
 
 
 def test_values_that_a_stack_does_not_have_are_nan_in_the_trace_and_null_in_payloads(

@@ -12,7 +12,7 @@ from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
+from tests.estimator.simulated_cell import TRUTH, pulses, run_divided, wrong_cell
 
 IDENTIFIER = IdentifierSettings()
 AFTER_HALF_AN_HOUR = slice(1800, None)
@@ -30,13 +30,7 @@ def test_step_and_run_leave_the_same_record_to_the_last_bit(load_and_soc) -> Non
     block["temperature_c"] = np.where(
         block["time_s"] % 7.0 == 0.0, np.nan, 25.0 + 10.0 * np.sin(block["time_s"] / 300.0)
     )
-    in_one_block, stepped, in_blocks = (Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=0.8) for _ in range(3))
-    in_one_block.run(block)
-    for row in block:
-        stepped.step(row["time_s"], row["current_a"], row["voltage_v"], 0, row["temperature_c"])
-    for part in np.array_split(block, 17):
-        in_blocks.run(part)
-    assert in_one_block.record.tobytes() == stepped.record.tobytes() == in_blocks.record.tobytes()
+    run_divided(lambda: Estimator(TRUTH, identifier=IDENTIFIER, initial_soc=0.8), block)
 
 
 def test_a_wrong_soc_and_wrong_resistances_are_corrected(load_and_soc) -> None:

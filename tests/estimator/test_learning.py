@@ -27,6 +27,7 @@ from tests.estimator.random_steps import (
     random_steps,
     relative_errors,
 )
+from tests.estimator.simulated_cell import run_divided
 
 NOISE_V = 1e-3
 """Std of the voltage noise [V]."""
@@ -159,12 +160,7 @@ def test_a_jump_of_a_resistance_is_learned_within_half_an_hour() -> None:
 
 
 def test_step_and_run_leave_the_same_state_to_the_last_bit(ten_hours: SampleBlock) -> None:
-    at_once, one_by_one = learner(file_off_by(*WRONG_FACTORS)), learner(file_off_by(*WRONG_FACTORS))
-    block = ten_hours[:2000]
-    at_once.run(block)
-    for x in block:
-        one_by_one.step(float(x["time_s"]), float(x["current_a"]), float(x["voltage_v"]), 0, float(x["temperature_c"]))
-    assert at_once.record.tobytes() == one_by_one.record.tobytes()
+    run_divided(lambda: learner(file_off_by(*WRONG_FACTORS)), ten_hours[:2000])
 
 
 def test_the_result_does_not_depend_on_the_sample_rate() -> None:

@@ -12,6 +12,7 @@ from bms_estimator.model.columns import Columns
 from bms_estimator.model.sample import SampleBlock
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import score
+from tests.estimator.simulated_cell import run_divided
 
 
 def discharged_fraction(samples: SampleBlock, cell: CellModel) -> np.ndarray:
@@ -50,8 +51,4 @@ def test_nees_and_nis_in_mid_load_match_the_std(data, soc_error):
 
 def test_run_and_step_give_bit_identical_states_on_a_real_capture(data):
     cell, capture = load_cell("leaf"), load_capture(data / "leaf" / "cc_1c.csv.gz")
-    whole, stepped = Estimator(cell), Estimator(cell)
-    whole.run(capture.rows)
-    for sample in capture.rows:
-        stepped.step(sample["time_s"], sample["current_a"], sample["voltage_v"])
-    assert whole.record.tobytes() == stepped.record.tobytes()
+    run_divided(lambda: Estimator(cell), capture.rows)

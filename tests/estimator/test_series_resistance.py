@@ -20,6 +20,7 @@ from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from tests.calibration.simulated_load import TRUTH, capture, steps
+from tests.estimator.simulated_cell import run_divided
 
 FIRST_SOC = 0.98
 CURRENT_A = 0.06
@@ -76,11 +77,8 @@ def test_live_r_s_equals_r_s_of_the_thesis_procedure_on_the_same_samples(load: S
 
 
 def test_step_and_run_give_bit_identical_r_s(load: SampleBlock) -> None:
-    whole, single = make_thesis_estimator(), make_thesis_estimator()
-    trace = whole.run(load[:3000])
-    for time_s, current_a, voltage_v, *_ in load[:3000].tolist():
-        single.step(time_s, current_a, voltage_v)
-    assert single.record.tobytes() == whole.record.tobytes()
+    run_divided(make_thesis_estimator, load[:3000])
+    trace = make_thesis_estimator().run(load[:3000])
     first_current = int(np.argmax(np.abs(load["current_a"]) > CURRENT_A))
     assert np.isnan(trace["r_s_ohm"][:first_current]).all()
     assert np.isfinite(trace["r_s_ohm"][-1])
