@@ -27,25 +27,6 @@ def values_of(forecast, *names):
 BAND = "time_to_cutoff_p05_s", "time_to_cutoff_s", "time_to_cutoff_p95_s"
 
 
-def test_any_division_into_blocks_gives_the_same_forecasts_to_the_last_bit(drive):
-    drive = drive[:4000]
-    whole = forecasting_pack()
-    step = whole.run(drive)
-    trace, rows = step.trace.copy(), step.forecasts
-    for size in (1, 7, 1000):
-        parts, traces, part_rows = forecasting_pack(), [], []
-        for start in range(0, drive.size, size):
-            step = parts.run(drive[start : start + size])
-            traces.append(step.trace.copy())
-            part_rows.append(step.forecasts)
-        assert np.concatenate(traces).tobytes() == trace.tobytes()
-        assert np.concatenate(part_rows).tobytes() == rows.tobytes()
-        assert (
-            parts.forecaster.latest.curve.voltage_p50_v.tobytes()
-            == whole.forecaster.latest.curve.voltage_p50_v.tobytes()
-        )
-
-
 def test_a_pack_with_a_slow_fit_has_a_forecast_for_each_trace_row(drive):
     estimator = Estimator(TRUTH, initial_soc=0.9)
     step = Pack(estimator, SlowFit(estimator), forecaster=Forecaster(estimator, cutoff_v=CUTOFF_V)).run(drive[:4000])

@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.cell_estimator import CellDeviations, CellEstimator
+from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.forecast.available_power import PowerLimits
 from bms_estimator.forecast.capability import write_capability
 from bms_estimator.forecast.forecast import unknown_values
-from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.cells.records import ReadingFault
-from bms_estimator.pack.pack import Pack
 from bms_estimator.simulation.simulated_bank import BankCells
 from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack
 
@@ -84,20 +81,3 @@ def test_a_cell_with_a_larger_resistance_limits_discharge_and_charge(pack: Simul
 def test_a_smaller_cell_limits_the_usable_capacity_in_proportion(pack: SimulatedPack) -> None:
     without, limited = capability(pack, None), capability(pack, cells_with(pack, capacity_ratio=-0.2))
     assert limited["usable_capacity_ah"] == pytest.approx(0.8 * without["usable_capacity_ah"], rel=0.03)
-
-
-def test_any_division_into_blocks_gives_the_same_power_of_the_weakest_cell_to_the_last_bit() -> None:
-    cells = BankCells.drawn(np.random.default_rng(4), CELLS, CAPACITY_AH, 0.9).with_weak_cell(1, capacity_ratio=0.8)
-    history = SimulatedPack(cells).bank.run(np.full(200, 10.0), 10.0)
-    samples, rows = history.samples(np.random.default_rng(1)), []
-    for length in (1, 7, 200):
-        estimator = Estimator(SimulatedPack(cells).model)
-        forecaster = Forecaster(estimator, cutoff_v=CUTOFF_V)
-        pack, parts = Pack(estimator, cells=CellEstimator(estimator), forecaster=forecaster), []
-        for begin in range(0, samples.size, length):
-            step = pack.run(samples[begin : begin + length], history.cell_v[begin : begin + length])
-            parts.append(step.forecasts)
-        rows.append(np.concatenate(parts).tobytes())
-    assert rows[0] == rows[1] == rows[2]
-    without = Forecaster(estimator, cutoff_v=CUTOFF_V).forecast().values["usable_capacity_ah"][0]
-    assert forecaster.forecast().values["usable_capacity_ah"][0] < 0.99 * without

@@ -130,14 +130,6 @@ def test_gap_that_may_hide_a_charge_begins_a_segment(samples: SampleBlock) -> No
     assert np.abs(second["hysteresis"][0]).max() < 1.0
 
 
-def test_blocks_of_any_size_record_the_same_rows(samples: SampleBlock, rows: np.ndarray) -> None:
-    slow_fit = SlowFit(Estimator(TRUTH, initial_soc=0.8), interval_s=np.inf)
-    for part in np.array_split(samples, 97):
-        Pack(slow_fit.estimator, slow_fit).run(part)
-    assert slow_fit.history.rows.tobytes() == rows[: slow_fit.history.rows.size].tobytes()
-    assert slow_fit.history.rows.size > 0.8 * rows.size
-
-
 @pytest.mark.parametrize("step_s", [1, 60])
 def test_rows_of_a_slow_source_contain_the_uncertainty_of_the_current_between_samples(step_s: int) -> None:
     """The true mean current deviates from the measured one by about the std of the row."""
