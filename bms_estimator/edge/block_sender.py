@@ -32,7 +32,7 @@ from bms_estimator.mqtt.denied_topics import DeniedTopics
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.queue_sender import QueueSender
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.tasks import FIRST_DELAY_S
+from bms_estimator.process.tasks import FIRST_DELAY_S, finish
 from bms_estimator.settings.exports import EdgeSettings
 from bms_estimator.store.database import RETRY_S, Database
 
@@ -284,11 +284,7 @@ class BlockSender:
         self._end_block()
         if self._task is not None:
             self._link.closing.set()
-            done, _ = await asyncio.wait([self._task], timeout=self._handover_s + DISCONNECT_TIMEOUT_S)
-            if not done:
-                self._task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await self._task
+            await finish(self._task, self._handover_s + DISCONNECT_TIMEOUT_S)
         await self._stack.aclose()
 
     def _watch_open_block(self) -> None:

@@ -1,7 +1,6 @@
 """Subscriber to all devices of a broker. It stores their latest messages and reconnects."""
 
 import asyncio
-import contextlib
 import secrets
 from collections.abc import Callable, Mapping
 from typing import Self
@@ -15,7 +14,7 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
 from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics, TopicCache
-from bms_estimator.process.tasks import FIRST_DELAY_S
+from bms_estimator.process.tasks import FIRST_DELAY_S, finish
 from bms_estimator.settings.mqtt import MqttSettings
 
 MAX_WAITING = 2000
@@ -123,11 +122,7 @@ class Subscriber:
         if self._task is None:
             return
         self._reconnect_loop.closing.set()
-        done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
-        if not done:
-            self._task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._task
+        await finish(self._task, CLOSING_S)
 
     async def _serve(self, connection: Connection) -> None:
         """Receive until the connection is lost or the subscriber closes."""

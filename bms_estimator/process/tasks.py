@@ -4,6 +4,7 @@ Some libraries, and wait_for of Python 3.11, may swallow a cancellation.
 """
 
 import asyncio
+import contextlib
 import random
 from collections.abc import Coroutine
 from typing import Any
@@ -52,6 +53,15 @@ async def end(*tasks: asyncio.Future[Any]) -> None:
         for task in unfinished:
             task.cancel()
         await asyncio.wait(unfinished, timeout=CANCEL_INTERVAL_S)
+
+
+async def finish(task: asyncio.Task[None], timeout_s: float) -> None:
+    """Wait until a task has ended, and cancel it after ``timeout_s``. Raise its exception."""
+    done, _ = await asyncio.wait([task], timeout=timeout_s)
+    if not done:
+        task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
 
 
 async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:

@@ -26,7 +26,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.process.systemd import credential
-from bms_estimator.process.tasks import FIRST_DELAY_S, Backoff
+from bms_estimator.process.tasks import FIRST_DELAY_S, Backoff, finish
 from bms_estimator.settings.exports import InfluxSettings
 
 STATE = "bms_state"
@@ -169,11 +169,7 @@ class InfluxSink:
             return
         self._closing.set()
         self._batch_is_full.set()
-        done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
-        if not done:
-            self._task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._task
+        await finish(self._task, CLOSING_S)
 
     async def _run(self) -> None:
         """Send queued lines every ``every_s``, or sooner if a batch is full.

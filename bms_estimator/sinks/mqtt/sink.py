@@ -23,7 +23,7 @@ from bms_estimator.mqtt.message import Message, OnResult
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.queue_sender import QueueSender
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.tasks import FIRST_DELAY_S
+from bms_estimator.process.tasks import FIRST_DELAY_S, finish
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.mqtt import HomeAssistantSettings, MqttSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, MessageBuilder, PublishedState
@@ -216,11 +216,7 @@ class MqttSink:
             return
         self._link.closing.set()
         self._wake.set()
-        done, _ = await asyncio.wait([self._task], timeout=CLOSING_S)
-        if not done:
-            self._task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._task
+        await finish(self._task, CLOSING_S)
 
     async def _serve(self, connection: Connection) -> None:
         """Send and receive until the connection is lost or the sink closes."""
