@@ -7,11 +7,10 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
-from bms_estimator.cli.options.page_options import Browser, TokenFile, open_browser, page_settings
+from bms_estimator.cli.options.page_options import Browser, TokenFile, page_settings, serve
 from bms_estimator.fleet.page import nats_feed
 from bms_estimator.fleet.page.fleet_page import fleet_page
 from bms_estimator.process.log_setup import configure_logs, flush_logs
-from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.page import PageSettings
 
 DEFAULT_LISTEN = "127.0.0.1:8080"
@@ -40,13 +39,5 @@ def page(
     settings = page_settings(PageSettings(), listen=listen, token_file=token_file, hosts=tuple(host or ()))
     configure_logs()
     with flush_logs():
-        asyncio.run(_serve(nats_feed.Server(server, creds, ca), settings, folder, browser=browser))
-
-
-async def _serve(server: nats_feed.Server, settings: PageSettings, folder: Path | None, *, browser: bool) -> None:
-    stop = stop_on_signal()
-    async with fleet_page(server, settings, folder) as url:
-        typer.echo(f"page of the fleet: {url}")
-        if browser:
-            open_browser(url)
-        await stop.wait()
+        fleet = fleet_page(nats_feed.Server(server, creds, ca), settings, folder)
+        asyncio.run(serve(fleet, "page of the fleet", browser=browser))

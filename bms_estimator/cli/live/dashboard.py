@@ -7,10 +7,9 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.pack_options import with_broker
-from bms_estimator.cli.options.page_options import Browser, TokenFile, open_browser, page_settings
-from bms_estimator.page.broker_page import dashboard as serve_page
+from bms_estimator.cli.options.page_options import Browser, TokenFile, page_settings, serve
+from bms_estimator.page.broker_page import dashboard as broker_page
 from bms_estimator.process.log_setup import configure_logs, flush_logs
-from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings, load_settings
@@ -47,13 +46,5 @@ def dashboard(
     page = page_settings(settings.page or PageSettings(), listen=listen, token_file=token_file)
     configure_logs()
     with flush_logs():
-        asyncio.run(_serve(broker, page, folder or state_folder(settings), browser=browser))
-
-
-async def _serve(broker: MqttSettings, page: PageSettings, folder: Path, *, browser: bool) -> None:
-    stop = stop_on_signal()
-    async with serve_page(broker, page, folder) as url:
-        typer.echo(f"live page: {url}")
-        if browser:
-            open_browser(url)
-        await stop.wait()
+        packs = broker_page(broker, page, folder or state_folder(settings))
+        asyncio.run(serve(packs, "live page", browser=browser))

@@ -4,6 +4,7 @@ import os
 import sys
 import threading
 import webbrowser
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,6 +13,7 @@ from pydantic import ValidationError
 
 from bms_estimator.model.config_file import error_reason
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.settings.page import PageSettings
 
 TokenFile = Annotated[Path | None, typer.Option(help="file with the access token of the page", show_default=False)]
@@ -45,3 +47,19 @@ def open_browser(url: str) -> None:
     if not sys.stdout.isatty() or not any(os.environ.get(name) for name in DESKTOP_VARIABLES):
         return
     threading.Thread(target=webbrowser.open, args=[url], name="browser", daemon=True).start()
+
+
+async def serve(page: AbstractAsyncContextManager[str], name: str, *, browser: bool) -> None:
+    """Serve a page, which yields its address, until a signal.
+
+    Args:
+        page: The page.
+        name: Description of the page, printed before its address.
+        browser: Open the page in a browser.
+    """
+    stop = stop_on_signal()
+    async with page as url:
+        typer.echo(f"{name}: {url}")
+        if browser:
+            open_browser(url)
+        await stop.wait()
