@@ -1,7 +1,6 @@
 """``bms-estimator validate``: comparison of a cell's model with a capture."""
 
 import json
-import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,6 +35,7 @@ from bms_estimator.model.arrays import Records, structured_array
 from bms_estimator.model.sample import fill_temperature
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.sinks.trace_file import table_sink
+from bms_estimator.telemetry.state import finite
 
 
 def validate_command(
@@ -117,7 +117,7 @@ def _json_result(validation: Validation, verdict: Verdict) -> dict[str, Any]:
             "glitches": validation.glitches,
             "resting": _errors(validation.resting),
             "loaded": _errors(validation.loaded),
-            "extra_series_resistance_ohm": _finite_or_none(validation.extra_ohm),
+            "extra_series_resistance_ohm": finite(validation.extra_ohm),
             "with_extra_series_resistance": _errors(validation.with_extra_ohm),
             "grade": verdict.grade,
             "verdict": verdict.text,
@@ -129,14 +129,10 @@ def _json_result(validation: Validation, verdict: Verdict) -> dict[str, Any]:
 def _errors(errors: Errors) -> dict[str, Any]:
     return {
         "samples": errors.samples,
-        "voltage_rms_mv": _finite_or_none(1e3 * errors.voltage_rms_v),
-        "mean_abs_percent": _finite_or_none(errors.mean_abs_percent),
-        "max_abs_percent": _finite_or_none(errors.max_abs_percent),
+        "voltage_rms_mv": finite(1e3 * errors.voltage_rms_v),
+        "mean_abs_percent": finite(errors.mean_abs_percent),
+        "max_abs_percent": finite(errors.max_abs_percent),
     }
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _tables(capture: Path, validation: Validation, verdict: Verdict) -> Group:

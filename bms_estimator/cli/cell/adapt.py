@@ -27,6 +27,7 @@ from bms_estimator.cli.options.capture_options import (
     write_cell_named_as_file,
 )
 from bms_estimator.model.cell import load_cell
+from bms_estimator.telemetry.state import finite
 
 
 def adapt_command(
@@ -67,7 +68,7 @@ def adapt_command(
 
 
 def _json_result(out: Path, adaptation: Adaptation) -> dict[str, Any]:
-    std = [None] * 12 + [_finite_or_none(x) for x in adaptation.steps.r_s.std]  # a1..a12 have no standard error
+    std = [None] * 12 + [finite(x) for x in adaptation.steps.r_s.std]  # a1..a12 have no standard error
     a = adaptation.steps.a[1:].tolist()
     return {
         "out": str(out),
@@ -82,23 +83,19 @@ def _json_result(out: Path, adaptation: Adaptation) -> dict[str, Any]:
                 "name": c.name,
                 "initial_soc": c.initial_soc,
                 "voltage_rms_mv_soc_above_0_1": 1e3 * c.voltage_rms_v,
-                "score_before_percent": _finite_or_none(c.score_before),
-                "score_after_percent": _finite_or_none(c.score_after),
+                "score_before_percent": finite(c.score_before),
+                "score_after_percent": finite(c.score_after),
                 "held_back": c.held_back,
             }
             for c in adaptation.captures
         ],
-        "score_before_percent": _finite_or_none(adaptation.score_before),
-        "score_after_percent": _finite_or_none(adaptation.score_after),
+        "score_before_percent": finite(adaptation.score_before),
+        "score_after_percent": finite(adaptation.score_after),
     }
 
 
 def _voltage_error_v(adaptation: Adaptation) -> float:
     return math.nan if adaptation.cell.ladder is None else adaptation.cell.ladder.error_v
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _remarks(cell: str, adaptation: Adaptation) -> list[str]:

@@ -35,6 +35,7 @@ from bms_estimator.cli.options.capture_options import (
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.cell import is_fuel_cell, load_cell
 from bms_estimator.model.errors import UserError
+from bms_estimator.telemetry.state import finite
 
 
 def identify_command(
@@ -128,8 +129,8 @@ def _json_result(out: Path, identification: Identification, duration_s: float) -
                 "temperature_c": c.temperature_c,
                 "miscount_percent": 100.0 * c.miscount,
                 "voltage_rms_mv_soc_above_0_1": 1e3 * c.voltage_rms_v,
-                "score_before_percent": _finite_or_none(c.score_before),
-                "score_after_percent": _finite_or_none(c.score_after),
+                "score_before_percent": finite(c.score_before),
+                "score_after_percent": finite(c.score_after),
                 "held_back": c.held_back,
             }
             for c in identification.captures
@@ -137,8 +138,8 @@ def _json_result(out: Path, identification: Identification, duration_s: float) -
         "left_out": list(identification.left_out),
         "undetermined_starts": list(identification.undetermined_starts),
         "ocv_correction_rms_mv": 1e3 * identification.ocv_correction_v,
-        "score_before_percent": _finite_or_none(identification.score_before),
-        "score_after_percent": _finite_or_none(identification.score_after),
+        "score_before_percent": finite(identification.score_before),
+        "score_after_percent": finite(identification.score_after),
         "seconds": duration_s,
     }
 
@@ -151,10 +152,6 @@ def _temperature_range_c(identification: Identification) -> tuple[float, float]:
 
 def _voltage_error_v(identification: Identification) -> float:
     return math.nan if identification.cell.ladder is None else identification.cell.ladder.error_v
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _remarks(initial_cell: str, identification: Identification) -> list[str]:

@@ -31,6 +31,7 @@ from bms_estimator.cli.options.capture_options import (
     write_cell_named_as_file,
 )
 from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.telemetry.state import finite
 
 STEEP_SOC = 0.05
 """Width of the ranges at both ends of the SOC in which OCV curves are steep."""
@@ -171,7 +172,7 @@ def _result(form: OcvForm, determined: OcvCell) -> OcvResult:
     return OcvResult(
         form=form.value,
         capacity_ah=ocv_sources.capacity_ah,
-        capacity_measured_ah=_finite_or_none(ocv_sources.measured_ah),
+        capacity_measured_ah=finite(ocv_sources.measured_ah),
         generic=generic.cell.name,
         usual_hysteresis=ocv_sources.usual_hysteresis,
         series_count=generic.cell.series_count,
@@ -200,17 +201,13 @@ def _source_results(fit: ChenMoraFit | TableFit, ocv_sources: OcvSources) -> lis
             name=source.name,
             kind=source.kind,
             points=source.points.soc.size,
-            temperature_c=_finite_or_none(source.temperature_c),
+            temperature_c=finite(source.temperature_c),
             off_mv=1e3 * float(fit.deviation_v[i]) if isinstance(fit, TableFit) else None,
             hysteresis_mv=None if source.hysteresis_v is None else 1e3 * float(source.hysteresis_v.mean()),
             notes=list(source.notes),
         )
         for i, source in enumerate(ocv_sources.sources)
     ]
-
-
-def _finite_or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def _remarks(result: OcvResult) -> list[str]:
