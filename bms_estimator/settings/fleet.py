@@ -3,25 +3,17 @@
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, AwareDatetime, Field, model_validator
+from pydantic import AwareDatetime, Field, model_validator
 
 from bms_estimator.model.config_file import Strict
 from bms_estimator.settings.pack import DeviceName
-from bms_estimator.settings.page import ListenAddress, parse_listen
+from bms_estimator.settings.page import Address, ListenAddress, parse_listen
 
 Gigabytes = Annotated[float, Field(gt=0, le=1e6)]
 PackCount = Annotated[int, Field(ge=1, le=10_000_000)]
 Days = Annotated[float, Field(gt=0, le=3660)]
 CellCount = Annotated[int, Field(ge=0, le=255)]
 TenantName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
-
-
-def _validate_listen(text: str) -> str:
-    parse_listen(text)
-    return text
-
-
-Address = Annotated[str, AfterValidator(_validate_listen)]
 
 
 class ServerSettings(Strict):

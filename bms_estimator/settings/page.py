@@ -51,10 +51,14 @@ def _validate_listen(text: str) -> str:
     return text
 
 
+Address = Annotated[str, AfterValidator(_validate_listen)]
+"""Text ``host:port``."""
+
+
 class PageSettings(Strict):
     """Live web page of the pack."""
 
-    listen: Annotated[str, AfterValidator(_validate_listen)] = Field(
+    listen: Address = Field(
         default=DEFAULT_LISTEN,
         description="host:port of the page; packs of one process with the same address share a page. An address that other machines can reach, such as 0.0.0.0:8765, requires token_file",
     )
