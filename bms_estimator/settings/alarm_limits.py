@@ -13,9 +13,12 @@ from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, AlarmKind
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
-from bms_estimator.settings.collapse_limit import collapse_limit
+from bms_estimator.settings.false_alarm_limits import (
+    DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH,
+    collapse_limit,
+    weak_cell_limit,
+)
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.weak_cell_limit import DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH, weak_cell_limit
 
 MIN_SILENT_LIMIT_S = 10.0
 """Minimum default limit of ``link_lost`` [s]."""

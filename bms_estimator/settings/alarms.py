@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import Field, model_validator
 
 from bms_estimator.model.config_file import Fraction, NotNegative, Positive, Strict
-from bms_estimator.settings.weak_cell_limit import DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH
+from bms_estimator.settings.false_alarm_limits import DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH
 
 AlarmName = Literal[
     "pack_over_voltage",
