@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.doctor.broker_check import check_broker
-from bms_estimator.doctor.finding import Finding, Level
-from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.finding import Finding, Level, Subject
 from tests.doctor.packs import subject
 from tests.free_port import free_port
 from tests.mosquitto import MOSQUITTO, Broker, Listener, password_broker

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.mqtt.message import OnResult
+from bms_estimator.mqtt.connection import OnResult
 from bms_estimator.service import job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.settings.alarms import AlarmHook

@@ -17,9 +17,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.client import DEFAULT_TIMEOUTS, Client
-from bms_estimator.mqtt.connection import Connection, ConnectOptions
+from bms_estimator.mqtt.connection import Connection, ConnectOptions, Message
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING, ReceiveQueue
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
