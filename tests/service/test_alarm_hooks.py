@@ -28,9 +28,9 @@ from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
 from bms_estimator.telemetry.alarms.message import Change
-from tests.collector import Collector
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
+from tests.scripted_source import Collector
 
 RAISED = Alarm(
     name="soc_low",
