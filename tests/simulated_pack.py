@@ -18,8 +18,7 @@ from bms_estimator.settings.sampling import BOARD
 from bms_estimator.simulation.simulated_bank import BankCells, BankHistory, SimulatedBank
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.alarms.message import Change
-from tests.collector import Collector
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 
 CELLS, CAPACITY_AH, STEP_S, BLOCK = 6, 20.0, 10.0, 30
 """Number of cells, their capacity [Ah], the interval of the samples [s], and the number of samples in a block."""

@@ -11,12 +11,10 @@ import secrets
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 
-from bms_estimator.doctor.finding import Finding, Level, fault, ok, warning
-from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.finding import Finding, Level, Subject, fault, ok, warning
 from bms_estimator.mqtt.broker_config import Broker, brokers
 from bms_estimator.mqtt.client import Timeouts
-from bms_estimator.mqtt.connection import BrokerConnectionError, Connection, ConnectOptions, LoginError
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import BrokerConnectionError, Connection, ConnectOptions, LoginError, Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.process.systemd import is_for_the_service
 from bms_estimator.settings.broker import BrokerSettings

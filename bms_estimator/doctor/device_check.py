@@ -11,8 +11,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from bms_estimator.doctor.finding import Finding, fault, ok, warning
-from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.finding import Finding, Subject, fault, ok, warning
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.protocols.registry import make_protocol

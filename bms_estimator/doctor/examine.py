@@ -14,11 +14,10 @@ from pathlib import Path
 
 from bms_estimator.doctor.broker_check import check_broker
 from bms_estimator.doctor.device_check import CELLS_S, FIRST_SAMPLE_S, check_device
-from bms_estimator.doctor.finding import Finding, fault, ok, warning
+from bms_estimator.doctor.finding import Finding, Subject, fault, ok, warning
 from bms_estimator.doctor.kernel_check import check_kernels
 from bms_estimator.doctor.port_check import check_port
 from bms_estimator.doctor.service_check import check_service
-from bms_estimator.doctor.subject import Subject
 from bms_estimator.installation import places
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.errors import UserError

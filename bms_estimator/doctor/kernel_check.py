@@ -5,8 +5,7 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from bms_estimator.doctor.finding import Finding, ok, warning
-from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.finding import Finding, Subject, ok, warning
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.numba_cache import SHIPPED_FOLDER, cache_folders, source_digest
 from bms_estimator.process.memory import available_bytes

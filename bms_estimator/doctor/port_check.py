@@ -7,8 +7,7 @@ import stat
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from bms_estimator.doctor.finding import Finding, fault, ok, warning
-from bms_estimator.doctor.subject import ROOT_USER, Subject, is_root
+from bms_estimator.doctor.finding import ROOT_USER, Finding, Subject, fault, is_root, ok, warning
 from bms_estimator.installation import places
 from bms_estimator.sources.serial.port_list import NoPortError, named_ports, resolve_port
 

@@ -3,8 +3,7 @@
 import os
 from collections.abc import Iterator
 
-from bms_estimator.doctor.finding import Finding, fault, ok, warning
-from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.finding import Finding, Subject, fault, ok, warning
 from bms_estimator.doctor.systemd_unit import SystemdUnit
 from bms_estimator.process.memory import has_memory_groups
 

@@ -19,7 +19,7 @@ from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import with_oldest
 from bms_estimator.edge.block_table import LATEST_S, NS, PageRead, StoreResult, StoreTransaction
 from bms_estimator.edge.subjects import BlockRequest
-from bms_estimator.mqtt.message import Message, QueuedMessage
+from bms_estimator.mqtt.connection import Message, QueuedMessage
 from bms_estimator.store.database import Database, StoreError
 
 MAX_WAITING_SAMPLES = 500_000

@@ -21,8 +21,13 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, PublishRejection, ReceivedMessage
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import (
+    BrokerConnectionError,
+    ConnectOptions,
+    Message,
+    PublishRejection,
+    ReceivedMessage,
+)
 from bms_estimator.mqtt.receive_queue import ReceiveQueue
 
 UNSUPPORTED_VERSION = 132

@@ -1,12 +1,31 @@
-"""Interface of a connection to a broker, implemented by ``client``."""
+"""Messages, and interface of a connection to a broker, implemented by ``client``."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import NamedTuple, Protocol
 
 from bms_estimator.mqtt.broker_config import Broker
-from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING
+
+OnResult = Callable[[str], object]
+"""Callback for the result of a message: the reason why the message was rejected or lost, or "" if it was acknowledged."""
+
+
+class Message(NamedTuple):
+    """MQTT message."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+
+
+class QueuedMessage(NamedTuple):
+    """Message on its way to the broker."""
+
+    number: int
+    """Position in the queue; consecutive messages have consecutive numbers."""
+    message: Message
 
 
 class BrokerConnectionError(Exception):

@@ -5,9 +5,8 @@ from collections.abc import Callable
 
 import structlog
 
-from bms_estimator.mqtt.connection import PublishRejection
+from bms_estimator.mqtt.connection import Message, PublishRejection
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.message import Message
 from bms_estimator.process.tasks import Backoff
 
 log = structlog.get_logger(__name__)

@@ -4,10 +4,9 @@ import asyncio
 from collections.abc import Sequence
 from typing import Protocol
 
-from bms_estimator.mqtt.connection import Connection
+from bms_estimator.mqtt.connection import Connection, QueuedMessage
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.denied_topics import DeniedTopics
-from bms_estimator.mqtt.message import QueuedMessage
 from bms_estimator.process.tasks import Backoff
 
 WINDOW = 16

@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Self
 
 from bms_estimator.mqtt.broker_config import brokers
-from bms_estimator.mqtt.connection import Connection, ConnectOptions
+from bms_estimator.mqtt.connection import Connection, ConnectOptions, Message
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
 from bms_estimator.settings.mqtt import MqttSettings

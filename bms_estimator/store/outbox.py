@@ -13,7 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
-from bms_estimator.mqtt.message import Message, OnResult, QueuedMessage
+from bms_estimator.mqtt.connection import Message, OnResult, QueuedMessage
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox_queue import PAGE, NumberRanges, OutboxQueue
 

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import chain
 
-from bms_estimator.mqtt.message import Message, OnResult, QueuedMessage
+from bms_estimator.mqtt.connection import Message, OnResult, QueuedMessage
 
 
 class NumberRanges:

@@ -141,12 +141,8 @@ def _written_bytes(pid: int) -> int:
 
 async def measure_all(seconds: float) -> list[float]:
     """Measure all cases at the same time."""
-    with tempfile.TemporaryDirectory(dir=Path.home() / ".cache") as folder:
-        broker = Broker(Path(folder)).start()
-        try:
-            return await asyncio.gather(*(measure(case, seconds, Path(folder), broker) for case in CASES))
-        finally:
-            broker.stop()
+    with tempfile.TemporaryDirectory(dir=Path.home() / ".cache") as folder, Broker(Path(folder)) as broker:
+        return await asyncio.gather(*(measure(case, seconds, Path(folder), broker) for case in CASES))
 
 
 def rows(minutes: float) -> Iterator[Row]:

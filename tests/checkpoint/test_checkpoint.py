@@ -29,9 +29,8 @@ from bms_estimator.model.payloads.health import Health
 from bms_estimator.service import checkpoint_writer, live_loop
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
-from tests.collector import Collector
 from tests.patience import LONG_S
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 
 CELL = load_cell("chen_mora")
 SETTINGS = Settings.model_validate({"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}})

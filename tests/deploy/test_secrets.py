@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.command_line import PROGRAM
-from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mosquitto import Broker, Listener
 from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
 from tests.serial_line import Line
@@ -37,15 +37,12 @@ folder = "{folder}/state"
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Broker]:
     """Start a broker that requires a client certificate."""
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     authority = Authority(tmp_path)
     for name in ("server", "pack"):
         authority.sign(name)
     files = f"cafile {tmp_path}/ca.crt\ncertfile {tmp_path}/server.crt\nkeyfile {tmp_path}/server.key\n"
-    broker = Broker(tmp_path, f"{files}require_certificate true\nallow_anonymous true").start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, f"{files}require_certificate true\nallow_anonymous true") as broker:
+        yield broker
 
 
 async def test_password_and_key_are_never_shown(tmp_path: Path, line: Line, broker: Broker, monkeypatch) -> None:

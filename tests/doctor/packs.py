@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.finding import Subject
 from bms_estimator.doctor.systemd_unit import SystemdUnit, parse_units
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.pack import Settings

@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.doctor.broker_check import check_broker
-from bms_estimator.doctor.finding import Finding, Level
-from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.finding import Finding, Level, Subject
 from tests.doctor.packs import subject
 from tests.free_port import free_port
-from tests.mosquitto import MOSQUITTO, Broker, Listener, password_broker
+from tests.mosquitto import Broker, Listener, password_broker
 
 READ = "topic read bms/house/request/+\n"
 WRITE = "topic write bms/house/#\n"
@@ -21,14 +20,11 @@ READ_BACK = "topic read bms/house/availability\n"
 @pytest.fixture
 def restricted_broker(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Broker]:
     """Run a broker that denies everything to anonymous clients except the topics of ``request.param``."""
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     access_list = tmp_path / "acl"
     access_list.write_text(request.param)
     access_list.chmod(0o600)
-    broker = Broker(tmp_path, f"allow_anonymous true\nacl_file {access_list}").start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, f"allow_anonymous true\nacl_file {access_list}") as broker:
+        yield broker
 
 
 def pack_at(folder: Path, *urls: str) -> Subject:
@@ -95,11 +91,7 @@ def test_an_unreachable_broker_is_a_fault_unless_there_is_another_one(tmp_path: 
 
 
 def test_a_rejected_login_names_the_settings_of_the_login(tmp_path: Path) -> None:
-    broker = password_broker(tmp_path)
-    broker.start()
-    try:
+    with password_broker(tmp_path) as broker:
         (rejected,) = check_broker(pack_at(tmp_path, broker.url))
-    finally:
-        broker.stop()
     assert rejected.level is Level.FAULT
     assert "mqtt.username" in rejected.remedy

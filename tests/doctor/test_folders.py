@@ -89,7 +89,7 @@ def test_without_a_writable_cache_folder_there_is_a_warning(cache: Path, monkeyp
 
 
 def test_the_cache_of_the_service_is_examined_if_there_is_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bms_estimator.doctor.subject.CACHE_ROOT", tmp_path)
+    monkeypatch.setattr("bms_estimator.doctor.finding.CACHE_ROOT", tmp_path)
     write(tmp_path / "bms-estimator" / source_digest() / COMPLETE_FILE, 1)
     (warm,) = check_kernels(subject(tmp_path, unit=unit_with()))
     assert warm.level is Level.OK

@@ -12,7 +12,7 @@ import pytest_asyncio
 from playwright.async_api import Browser
 
 from tests.free_port import free_port
-from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mosquitto import Broker, Listener
 from tests.page.chromium import Tab, chromium, tab
 from tests.page.house import Service, simulated
 
@@ -26,11 +26,8 @@ PROFILE = [[0, 300], [600, 900], [630, 300], [1800, 0]]
 
 @pytest.fixture(scope="module")
 def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
-    running = Broker(tmp_path_factory.mktemp("broker")).start()
-    yield running
-    running.stop()
+    with Broker(tmp_path_factory.mktemp("broker")) as running:
+        yield running
 
 
 @module_fixture

@@ -15,8 +15,8 @@ from bms_estimator.protocols.firmware.messages import MessageType, command
 from bms_estimator.service import relay_hook
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
-from tests.collector import Collector
 from tests.patience import LONG_S, until
+from tests.scripted_source import Collector
 from tests.simavr_board import SimavrBoard, write_readings
 
 pytestmark = pytest.mark.usefixtures("firmware")

@@ -7,7 +7,7 @@ import pytest
 
 from tests.home_assistant.instance import ENVIRONMENT, MISSING, HomeAssistant
 from tests.home_assistant.packs import Packs
-from tests.mosquitto import MOSQUITTO, Broker
+from tests.mosquitto import Broker
 
 DASHBOARD = Path(__file__).parents[2] / "deploy/home-assistant/dashboard.yaml"
 
@@ -17,11 +17,8 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
     """Start a broker, or skip the tests if Home Assistant is not installed."""
     if not (ENVIRONMENT / "ready").exists():
         pytest.skip(MISSING)
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
-    broker = Broker(tmp_path_factory.mktemp("broker")).start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path_factory.mktemp("broker")) as broker:
+        yield broker
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import aiomqtt
 import pytest
 
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import Message
 from bms_estimator.settings.mqtt import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState

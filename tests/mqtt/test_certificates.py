@@ -17,7 +17,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
-from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mosquitto import Broker, Listener
 from tests.mqtt.certificates import Authority, openssl
 from tests.patience import until
 from tests.sinks.sink_helpers import STATE_TOPIC
@@ -38,15 +38,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def strict_broker(folder: Path, tmp_path: Path) -> Iterator[Broker]:
     """Start a broker that requires client certificates, and takes the user name from the certificate."""
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
-    broker = Broker(
+    with Broker(
         tmp_path,
         f"cafile {folder / 'ca.crt'}\ncertfile {folder / 'server.crt'}\nkeyfile {folder / 'server.key'}\n"
         "require_certificate true\nuse_identity_as_username true",
-    ).start()
-    yield broker
-    broker.stop()
+    ) as broker:
+        yield broker
 
 
 def settings(broker: Broker, folder: Path, name: str | None) -> MqttSettings:

@@ -11,7 +11,7 @@ import structlog
 from bms_estimator.mqtt.client import Timeouts
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
-from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy, read_packet
 from tests.patience import LONG_S, until
 from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, state_numbers
@@ -28,12 +28,9 @@ def connect_options(url: str | tuple[str, ...], timeouts: Timeouts = SHORT_TIMEO
 
 @pytest.fixture
 def second_broker(tmp_path: Path) -> Iterator[Broker]:
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     (tmp_path / "second").mkdir()
-    broker = Broker(tmp_path / "second").start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path / "second") as broker:
+        yield broker
 
 
 @pytest.fixture(params=["MQTT 5", "MQTT 3.1.1"])
@@ -189,12 +186,9 @@ async def test_abandoned_attempt_does_not_close_the_next_connection(
 @pytest.fixture
 def state_denying_broker(tmp_path: Path) -> Iterator[Broker]:
     """Start a broker that rejects states."""
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     (tmp_path / "acl").write_text(f"topic deny {STATE_TOPIC}\ntopic readwrite #\n")
-    broker = Broker(tmp_path, f"allow_anonymous true\nacl_file {tmp_path / 'acl'}").start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, f"allow_anonymous true\nacl_file {tmp_path / 'acl'}") as broker:
+        yield broker
 
 
 async def test_rejected_states_are_counted_and_do_not_block_other_topics(state_denying_broker: Broker) -> None:

@@ -12,7 +12,7 @@ import structlog
 from bms_estimator.mqtt.subscriber import MAX_BYTES, Subscriber
 from bms_estimator.mqtt.topic_cache import DeviceMessage
 from bms_estimator.settings.mqtt import MqttSettings
-from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S, until
 from tests.sinks.sink_helpers import Sink
@@ -138,11 +138,8 @@ async def test_exception_of_the_message_callback_ends_the_subscriber(broker: Bro
 
 @pytest.fixture
 def broker_with_passwords(tmp_path: Path) -> Iterator[Broker]:
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
-    broker = Broker(tmp_path, "allow_anonymous false").start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, "allow_anonymous false") as broker:
+        yield broker
 
 
 async def test_rejected_connection_is_reported_with_the_reason(broker_with_passwords: Broker) -> None:

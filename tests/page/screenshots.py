@@ -29,13 +29,12 @@ from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.source import ReceivedSamples
-from tests.collector import Collector
 from tests.device_line import running_device
 from tests.free_port import free_port
 from tests.page.chromium import DESKTOP, PHONE, Tab, chromium, tab
 from tests.page.test_setup import answer_questions, compare_voltage, search_and_choose
 from tests.patience import LONG_S
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 from tests.store.test_history import record_history
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"

@@ -24,7 +24,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.telemetry.state import forecast_fields, no_forecast
 from tests.free_port import free_port
-from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mosquitto import Broker, Listener
 from tests.page.chromium import PHONE, Tab, chromium, tab
 from tests.page.house import Service, start_program
 from tests.sinks.snapshots import CELL_SNAPSHOT, CELLS_REPORT, FORECAST, STACK_SNAPSHOT, forecast_at
@@ -111,11 +111,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def broker(folder: Path) -> Iterator[Broker]:
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
-    running = Broker(folder).start()
-    yield running
-    running.stop()
+    with Broker(folder) as running:
+        yield running
 
 
 @module_fixture

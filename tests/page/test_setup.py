@@ -112,9 +112,8 @@ async def page_after(client: ClientSession, server_url: str, path: str, **fields
 
 async def test_a_broker_with_a_password_is_searched_after_a_login(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("bms_estimator.setup.search.LISTEN_S", 0.5)
-    broker = password_broker(tmp_path).start()
-    login = {"url": broker.url, "username": "owner"}
-    try:
+    with password_broker(tmp_path) as broker:
+        login = {"url": broker.url, "username": "owner"}
         async with SetupServer(loopback(), tmp_path / "pack.toml") as server, ClientSession() as client:
             page = await page_after(client, server.url, "search", places=broker.url)
             assert f"Log in at {broker.url}" in page
@@ -127,8 +126,6 @@ async def test_a_broker_with_a_password_is_searched_after_a_login(tmp_path: Path
             page = await page_after(client, server.url, "search", places=again[1])
             assert f"{broker.url}: no message of a known publisher" in page
             assert PASSWORD not in page
-    finally:
-        broker.stop()
 
 
 async def test_a_failed_search_is_reported_and_can_be_repeated(tmp_path: Path) -> None:

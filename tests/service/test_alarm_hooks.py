@@ -16,7 +16,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.model.payloads.snapshot import Alarm
-from bms_estimator.mqtt.message import OnResult
+from bms_estimator.mqtt.connection import OnResult
 from bms_estimator.service import alarm_hooks, job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import hook_warnings
@@ -28,9 +28,9 @@ from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
 from bms_estimator.telemetry.alarms.message import Change
-from tests.collector import Collector
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
+from tests.scripted_source import Collector
 
 RAISED = Alarm(
     name="soc_low",

@@ -39,10 +39,9 @@ from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, edit_settings
 from tests.checkpoint.test_identity import CHECKPOINT_FILE
-from tests.collector import Collector
 from tests.patience import LONG_S
 from tests.patience import until as wait_until
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 from tests.service.test_alarm_hooks import acknowledge_in
 
 OVER_VOLTAGE = [(float(t), 0.0, 4.4 if t < 5 else 3.8, 25.0, 0) for t in range(20)]

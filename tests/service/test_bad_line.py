@@ -19,8 +19,8 @@ from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.serial_source import SerialSource
-from tests.collector import Collector
 from tests.patience import LONG_S, until
+from tests.scripted_source import Collector
 from tests.serial_line import Line
 
 CELL = load_cell("chen_mora")

@@ -11,15 +11,13 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.pack import Settings
 from tests.free_port import free_port
-from tests.influxdb import INFLUXD, InfluxDB
+from tests.influxdb import InfluxDB
 from tests.patience import LONG_S
 from tests.serial_line import Line
 
 
 async def test_samples_of_a_board_reach_influxdb_and_prometheus(line: Line, tmp_path: Path) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client is not installed: pip install prometheus-client")
-    if INFLUXD is None:
-        pytest.skip("influxd is not installed (apt-get install influxdb)")
     influxdb, listen = InfluxDB(tmp_path), f"127.0.0.1:{free_port()}"
     await asyncio.to_thread(influxdb.start)
     settings = Settings.model_validate(

@@ -31,9 +31,8 @@ from tests.checkpoint.test_checkpoint import (
     save_as,
     with_checkpoint,
 )
-from tests.collector import Collector
 from tests.patience import LONG_S
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 
 
 def clock_at(hours: float) -> BootTimestamp:

@@ -34,9 +34,8 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.publish_window import REST_S
-from tests.collector import Collector
 from tests.patience import LONG_S, until
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 
 CELL = load_cell("chen_mora")
 SETTINGS = Settings(pack=PackSettings(initial_soc=0.5), publish=PublishSettings(rate_hz=10.0))

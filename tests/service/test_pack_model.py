@@ -32,12 +32,11 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.state import finite
-from tests.collector import Collector
 from tests.estimator.anywhere.use import days
 from tests.estimator.simulated_cell import TRUTH, measured, wrong_cell
 from tests.pack_model.quick_fit import LN_CAPACITY, quick_fit
 from tests.patience import LONG_S
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 
 FORMAT_7_FILE = Path(__file__).parent.parent / "checkpoint" / "checkpoint_format_7.npz"
 """Checkpoint of a ``chen_mora`` cell by a version without history; SOC 0.3710."""

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.mqtt.message import OnResult
+from bms_estimator.mqtt.connection import OnResult
 from bms_estimator.service import job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.telemetry.alarms.message import Change
-from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import until
 from tests.service.test_alarm_hooks import CLEARED, RAISED, wait_for_health
@@ -36,8 +36,6 @@ async def run_hook(sink: Sink, **changes: Any) -> AsyncIterator[AlarmHooks]:
 
 @pytest.fixture
 def stopped_broker(tmp_path: Path) -> Broker:
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     (tmp_path / "acl").write_text(DENIED)
     return Broker(tmp_path, f"allow_anonymous true\nacl_file {tmp_path / 'acl'}")
 
@@ -45,8 +43,7 @@ def stopped_broker(tmp_path: Path) -> Broker:
 async def test_a_denied_message_makes_the_hook_fail_until_the_broker_accepts_it(
     stopped_broker: Broker, tmp_path: Path
 ) -> None:
-    broker = stopped_broker.start()
-    try:
+    with stopped_broker as broker:
         with capture_logs() as lines:
             async with Listener(broker) as live, run_hook(Sink(broker.url)) as hooks:
                 hooks.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
@@ -61,15 +58,12 @@ async def test_a_denied_message_makes_the_hook_fail_until_the_broker_accepts_it(
                 await wait_for_health(hooks, lambda health: (health.done, health.failing) == (1, []))
                 assert hooks.finished_hashes
         assert [line["hook"] for line in lines if line["event"].startswith("alarm hook")] == ["publish on load/set"]
-    finally:
-        broker.stop()
 
 
 async def test_the_end_of_an_alarm_whose_message_was_denied_replaces_the_message(
     stopped_broker: Broker, tmp_path: Path
 ) -> None:
-    broker = stopped_broker.start()
-    try:
+    with stopped_broker as broker:
         async with Listener(broker) as live, run_hook(Sink(broker.url)) as hooks:
             hooks.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
             await wait_for_health(hooks, lambda health: health.failures >= 1)
@@ -79,8 +73,6 @@ async def test_the_end_of_an_alarm_whose_message_was_denied_replaces_the_message
             broker.reload()
             await wait_for_health(hooks, lambda health: (health.done, health.failing) == (1, []))
             assert live.all("load/set") == [b"soc_low cleared"]
-    finally:
-        broker.stop()
 
 
 @pytest.mark.parametrize("cycles", range(10))  # in one of them, the denied job is due while the last one waits
@@ -106,13 +98,10 @@ async def test_a_denied_message_does_not_remove_the_job_of_a_newer_alarm(
 
 
 async def test_a_broker_with_mqtt_3_does_not_report_a_denied_message(stopped_broker: Broker) -> None:
-    broker = stopped_broker.start()
-    try:
+    with stopped_broker as broker:
         async with Proxy(broker.port, supports_5=False) as proxy, run_hook(Sink(proxy.url)) as hooks:
             hooks.on_alarm_change(Change(at_s=0.0, alarm=RAISED))
             assert (await wait_for_health(hooks, lambda health: health.done == 1)).failing == []
-    finally:
-        broker.stop()
 
 
 async def test_a_message_that_is_not_acknowledged_in_time_makes_the_hook_fail_until_it_is_delivered(
@@ -125,11 +114,8 @@ async def test_a_message_that_is_not_acknowledged_in_time_makes_the_hook_fail_un
         assert health.done == 0
         assert health.failing == ["publish on load/set: not acknowledged by the broker within 0.05 s; still queued"]
         assert not hooks.finished_hashes
-        stopped_broker.start()
-        try:
+        with stopped_broker:
             await wait_for_health(hooks, lambda health: (health.done, health.failing) == (1, []))
-        finally:
-            stopped_broker.stop()
 
 
 async def test_a_full_outbox_drops_estimates_before_the_messages_of_hooks(broker: Broker) -> None:

@@ -13,8 +13,7 @@ from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples
-from tests.collector import Collector
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 
 
 def test_suspected_input_faults_are_logged_when_their_set_changes() -> None:

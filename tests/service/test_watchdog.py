@@ -19,9 +19,8 @@ from bms_estimator.sources.serial.serial_port import SerialPort
 from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import SourceHealth
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS
-from tests.collector import Collector
 from tests.patience import LONG_S
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 
 
 class Systemd:

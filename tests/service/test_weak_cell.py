@@ -18,9 +18,8 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_bank import BankCells
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.alarms.message import Change
-from tests.collector import Collector
 from tests.pack_model.bank_cycles import ONE_C, cycle, new_bank
-from tests.scripted_source import ScriptedSource
+from tests.scripted_source import Collector, ScriptedSource
 
 SERIES, STEP_S, BLOCK = 3, 5.0, 36
 WEAK_CYCLE, REPLACED_CYCLE, CYCLES = 3, 4, 5

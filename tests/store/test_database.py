@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import Message
 from bms_estimator.store import database as database_module
 from bms_estimator.store.database import FREE_PAGES, Database, StoreError
 from bms_estimator.store.history import HistorySink

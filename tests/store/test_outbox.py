@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import Message
 from bms_estimator.store import outbox as outbox_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox

@@ -14,7 +14,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import Message
 from bms_estimator.store import outbox as outbox_module
 from bms_estimator.store import outbox_queue as queue_module
 from bms_estimator.store.database import Database, StoreError

@@ -1,6 +1,6 @@
 """Order of queued messages, without a disk."""
 
-from bms_estimator.mqtt.message import Message, QueuedMessage
+from bms_estimator.mqtt.connection import Message, QueuedMessage
 from bms_estimator.store.outbox_queue import MAX_TAIL, MIN_NUMBER, PAGE, NumberRanges, OutboxQueue
 
 

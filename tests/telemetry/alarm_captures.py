@@ -19,9 +19,9 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
 from bms_estimator.sources.captures.replay import Replay, open_capture
 from bms_estimator.telemetry.alarms.message import Change
-from tests.collector import Collector
 from tests.estimator.anywhere.cases import OXIDE
 from tests.estimator.anywhere.truth import curve_of, simulate
+from tests.scripted_source import Collector
 
 WALL_S = 1_700_000_000.0
 """Wall clock at the start of a capture [s since 1970]."""

@@ -20,8 +20,7 @@ from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.doctor.device_check import load_decoder
 from bms_estimator.doctor.examine import examine
-from bms_estimator.doctor.finding import Finding, Level, fault
-from bms_estimator.doctor.subject import Subject
+from bms_estimator.doctor.finding import Finding, Level, Subject, fault
 from bms_estimator.doctor.systemd_unit import unit_of
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.errors import UserError

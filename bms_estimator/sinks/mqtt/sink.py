@@ -16,10 +16,9 @@ import structlog
 
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, ReceivedMessage
+from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, Message, OnResult, ReceivedMessage
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.mqtt.denied_topics import DeniedTopics
-from bms_estimator.mqtt.message import Message, OnResult
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.queue_sender import QueueSender
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop

@@ -18,7 +18,7 @@ from rich.live import Live
 
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import Message
 from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics, TopicCache
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.terminal.json_fields import JsonFields

@@ -12,8 +12,14 @@ import structlog
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import BrokerConnectionError, Connect, Connection, ConnectOptions, ReceivedMessage
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import (
+    BrokerConnectionError,
+    Connect,
+    Connection,
+    ConnectOptions,
+    Message,
+    ReceivedMessage,
+)
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.broker import BrokerSettings

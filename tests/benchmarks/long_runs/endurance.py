@@ -231,12 +231,8 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
     if options.lost:
         yield from lost_sensor_rows(options.lost)
     if options.minutes:
-        with tempfile.TemporaryDirectory() as folder:
-            broker = Broker(Path(folder)).start()
-            try:
-                run = asyncio.run(serve(options.rate, 60.0 * options.minutes, Path(folder), broker))
-            finally:
-                broker.stop()
+        with tempfile.TemporaryDirectory() as folder, Broker(Path(folder)) as broker:
+            run = asyncio.run(serve(options.rate, 60.0 * options.minutes, Path(folder), broker))
         faults = {
             name: run.line[name]
             for name in ("frames_lost", "crc_errors", "cobs_errors", "length_errors", "clock_jumps")
@@ -274,12 +270,9 @@ def idle_rows() -> Iterator[Row]:
     """Attack the listeners with idle connections."""
     with tempfile.TemporaryDirectory() as name, few_descriptors():
         folder = Path(name)
-        broker = Broker(folder).start()
-        try:
+        with Broker(folder) as broker:
             yield _idle_row("service: page and [prometheus]", attack_service(folder, broker))
             yield _idle_row("dashboard", attack_dashboard(folder, broker))
-        finally:
-            broker.stop()
         with running(folder, partitions=1) as cluster:
             yield _idle_row("fleet page", attack_fleet_page(folder, cluster))
 
@@ -297,12 +290,8 @@ def _idle_row(program: str, attack: Coroutine[None, None, Outcome]) -> Row:
 
 def lost_sensor_rows(lost_s: float) -> Iterator[Row]:
     """Measure the reaction to a lost sensor."""
-    with tempfile.TemporaryDirectory() as folder:
-        broker = Broker(Path(folder)).start()
-        try:
-            yield from lost_sensor.rows(broker, Path(folder), lost_s)
-        finally:
-            broker.stop()
+    with tempfile.TemporaryDirectory() as folder, Broker(Path(folder)) as broker:
+        yield from lost_sensor.rows(broker, Path(folder), lost_s)
 
 
 def main() -> None:

@@ -7,7 +7,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -136,13 +135,13 @@ def rows() -> Iterator[Row]:
 def measure(rate_hz: int) -> Run:
     """Run board, broker, service and subscriber, and return the results."""
     folder = tempfile.TemporaryDirectory()
-    with folder as path, TimedBoard(rate_hz) as board, broker(Path(path)) as server:
+    with folder as path, TimedBoard(rate_hz) as board, Broker(Path(path)) as server:
         return asyncio.run(_measure(Path(path), board, rate_hz, server))
 
 
 def measure_bare_publish() -> float:
     """Return the median time from a publish to its reception through the same kind of broker [s]."""
-    with tempfile.TemporaryDirectory() as path, broker(Path(path)) as server:
+    with tempfile.TemporaryDirectory() as path, Broker(Path(path)) as server:
         return asyncio.run(_bare_publish(server))
 
 
@@ -159,16 +158,6 @@ async def _bare_publish(server: Broker) -> float:
             latency_s.append(time.monotonic() - sent_s)
             await publishing
     return float(np.median(latency_s))
-
-
-@contextmanager
-def broker(folder: Path) -> Iterator[Broker]:
-    """Run Mosquitto on a free port."""
-    server = Broker(folder).start()
-    try:
-        yield server
-    finally:
-        server.stop()
 
 
 def pack_file(folder: Path, name: str, port: str, rate_hz: int, server: Broker, publish_rate_hz: float) -> Path:

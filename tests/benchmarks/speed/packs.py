@@ -21,7 +21,6 @@ from tests.benchmarks.speed.live import (
     SETTLE_S,
     Broker,
     TimedBoard,
-    broker,
     pack_file,
 )
 from tests.benchmarks.table import Row
@@ -38,7 +37,7 @@ def rows() -> Iterator[Row]:
         return
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        server = stack.enter_context(broker(folder))
+        server = stack.enter_context(Broker(folder))
         boards = [stack.enter_context(TimedBoard(RATE_HZ)) for _ in range(PACKS)]
         cpu, health = asyncio.run(_measure(folder, boards, server))
     online = sum(h["sensor_online"] for h in health.values())

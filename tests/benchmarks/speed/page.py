@@ -95,13 +95,9 @@ def service_processes(service: Service) -> list[psutil.Process]:
 
 
 async def main(minutes: float) -> None:
-    with tempfile.TemporaryDirectory() as temporary:
-        broker = Broker(Path(temporary)).start()
-        try:
-            async with Service(Path(temporary), broker, free_port(), simulated()) as service:
-                await measure(service, minutes)
-        finally:
-            broker.stop()
+    with tempfile.TemporaryDirectory() as temporary, Broker(Path(temporary)) as broker:
+        async with Service(Path(temporary), broker, free_port(), simulated()) as service:
+            await measure(service, minutes)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from bms_estimator.model.errors import TemporaryError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.exports import InfluxSettings
 from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink, lines
-from tests.influxdb import INFLUXD, InfluxDB
+from tests.influxdb import InfluxDB
 from tests.patience import until
 from tests.sinks.snapshots import CELL_SNAPSHOT, SNAPSHOT_WITHOUT_SAMPLES, SOC_LOW_ALARM
 
@@ -33,11 +33,8 @@ def snapshot_at(second: int, **changes: Any) -> Snapshot:
 
 @pytest.fixture(scope="module")
 def influxdb(tmp_path_factory: pytest.TempPathFactory) -> Iterator[InfluxDB]:
-    if INFLUXD is None:
-        pytest.skip("influxd is not installed (apt-get install influxdb)")
-    server = InfluxDB(tmp_path_factory.mktemp("influxdb")).start()
-    yield server
-    server.stop()
+    with InfluxDB(tmp_path_factory.mktemp("influxdb")) as server:
+        yield server
 
 
 def sink(url: str, **options: Any) -> InfluxSink:

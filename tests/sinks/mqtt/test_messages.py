@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.payloads.snapshot import Alarm
-from bms_estimator.mqtt.message import Message
+from bms_estimator.mqtt.connection import Message
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.topics import schema

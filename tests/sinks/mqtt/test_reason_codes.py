@@ -19,7 +19,7 @@ from bms_estimator.settings.sources.mqtt import SourceBroker
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox
-from tests.mosquitto import MOSQUITTO, Broker, Listener
+from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S, until
 from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state, state_numbers
@@ -30,19 +30,11 @@ IMPLEMENTATION_ERROR, NOT_AUTHORIZED, QUOTA_EXCEEDED, INVALID_PAYLOAD_FORMAT = 1
 WRONG_PASSWORD_REASON = "Not authorized (135): name or password wrong"
 
 
-def start_broker(folder: Path, extra: str) -> Broker:
-    """Start a broker with additional lines of configuration, or skip the test without Mosquitto."""
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
-    return Broker(folder, extra).start()
-
-
 @pytest.fixture
 def locked_broker(tmp_path: Path) -> Iterator[Broker]:
     """Start a broker that accepts no client, because it has no user."""
-    broker = start_broker(tmp_path, "allow_anonymous false")
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, "allow_anonymous false") as broker:
+        yield broker
 
 
 @pytest.mark.parametrize("supports_5", [True, False])
@@ -100,9 +92,8 @@ async def test_reason_of_a_disconnect_is_reported(broker: Broker, code: int, exp
 @pytest.fixture
 def limited_broker(tmp_path: Path) -> Iterator[Broker]:
     """Start a broker with a maximum message size of 4 kB that handles one message at a time."""
-    broker = start_broker(tmp_path, "allow_anonymous true\nmax_packet_size 4000\nmax_inflight_messages 1")
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, "allow_anonymous true\nmax_packet_size 4000\nmax_inflight_messages 1") as broker:
+        yield broker
 
 
 async def test_message_above_the_size_limit_is_reported_and_not_sent(

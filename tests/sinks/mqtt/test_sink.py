@@ -17,9 +17,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.client import DEFAULT_TIMEOUTS, Client
-from bms_estimator.mqtt.connection import Connection, ConnectOptions
+from bms_estimator.mqtt.connection import Connection, ConnectOptions, Message
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.message import Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
 from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING, ReceiveQueue
 from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
@@ -91,8 +90,6 @@ async def test_retained_messages_are_sent_again_after_a_birth_message_of_home_as
 
 
 async def test_restarted_broker_is_served_and_drops_are_counted(tmp_path: Path) -> None:
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     broker = Broker(tmp_path)
     async with Sink(broker.url) as sink:
         for _ in range(5):
@@ -323,12 +320,9 @@ async def test_sink_works_with_the_demo_broker_without_mqtt_5() -> None:
 @pytest.fixture
 def denying_broker(tmp_path: Path) -> Iterator[Broker]:
     """Start a broker that denies all topics. Mosquitto reports a denial only to MQTT 5 clients that publish."""
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     (tmp_path / "acl").write_text("topic read nothing\n")
-    broker = Broker(tmp_path, f"allow_anonymous true\nacl_file {tmp_path / 'acl'}").start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, f"allow_anonymous true\nacl_file {tmp_path / 'acl'}") as broker:
+        yield broker
 
 
 async def test_silent_denial_is_detected_by_the_missing_echo_of_online(denying_broker: Broker) -> None:
@@ -382,9 +376,8 @@ def broker_without_requests(tmp_path: Path) -> Iterator[Broker]:
     (tmp_path / "acl.json").write_text(json.dumps(acl))
     (tmp_path / "acl.json").chmod(0o600)
     extra = f"allow_anonymous true\nplugin {DYNAMIC_SECURITY}\nplugin_opt_config_file {tmp_path / 'acl.json'}"
-    broker = Broker(tmp_path, extra).start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, extra) as broker:
+        yield broker
 
 
 @pytest.mark.parametrize("supports_5", [True, False])
@@ -407,8 +400,6 @@ async def test_denied_subscription_is_reported_in_log_and_health(
 @pytest.fixture
 def secure_broker(tmp_path: Path) -> Iterator[Broker]:
     """Start a broker that requires user name, password and TLS; its folder has the certificate and the password."""
-    if MOSQUITTO is None:
-        pytest.skip("mosquitto is not installed (apt-get install mosquitto)")
     key, certificate, passwords = (tmp_path / name for name in ("key.pem", "cert.pem", "passwords"))
     subprocess.run(
         ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes",
@@ -419,9 +410,8 @@ def secure_broker(tmp_path: Path) -> Iterator[Broker]:
     subprocess.run(["mosquitto_passwd", "-b", "-c", passwords, "meter", "s3cret"], check=True, capture_output=True)
     (tmp_path / "secret").write_text("s3cret\n")
     security = f"allow_anonymous false\npassword_file {passwords}\ncertfile {certificate}\nkeyfile {key}"
-    broker = Broker(tmp_path, security).start()
-    yield broker
-    broker.stop()
+    with Broker(tmp_path, security) as broker:
+        yield broker
 
 
 async def test_sink_connects_with_user_name_password_and_tls(secure_broker: Broker, tmp_path: Path) -> None:
