@@ -69,7 +69,10 @@ async def ask_weak_cell(processes: Processes, folder: Path) -> dict[str, Any]:
 
     async def read() -> dict[str, Any] | None:
         answer = await processes.output("ask", "failing", "--folder", folder, "--json")
-        return next((row for row in json.loads(answer or "[]") if (row["pack"], row["quantity"]) == (WEAK_CELL, "cell SOC")), None)
+        return next(
+            (row for row in json.loads(answer or "[]") if (row["pack"], row["quantity"]) == (WEAK_CELL, "cell SOC")),
+            None,
+        )
 
     await processes.until(lambda: any(folder.glob("date=*/*.parquet")))
     return await processes.poll(read)
