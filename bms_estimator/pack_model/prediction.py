@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.accumulators.history import HYSTERESIS_SOC, ROW_SOC
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, TAUS, TREND, WEAK_J
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
+    REFERENCE_C,
+    TAUS,
+    TREND,
+)
 from bms_estimator.kernels.pack_voltage import MODEL_ROW, RESISTANCE_GROUPS, voltage_derivatives, voltages
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.aging import RESISTANCE, AgingVariance
@@ -84,7 +91,7 @@ class VoltageModel:
         self.cell, self.unknowns, self.intervals = cell, u, intervals
         rows = intervals.rows
         temperature_c: Floats = rows["temperature_c"]
-        weak, strong = arrhenius(WEAK_J, temperature_c), arrhenius(STRONG_J, temperature_c)
+        weak, strong = arrhenius(LOW_ACTIVATION_ENERGY, temperature_c), arrhenius(HIGH_ACTIVATION_ENERGY, temperature_c)
         current_a = np.column_stack([rows["current_a"], rows["x_a"]])
         z = np.clip(reference.soc, 0.0, 1.0)
         ohm = cell.resistances(z, weak, strong)
@@ -96,7 +103,10 @@ class VoltageModel:
             rows["direction"] + 1.0,
         )
         terms["above_25_c_k"], terms["weak"], terms["strong"] = temperature_c - REFERENCE_C, weak, strong
-        terms["one_c_a"], terms["hysteresis_factor"] = cell.one_c_a, arrhenius(HYSTERESIS_J, temperature_c)
+        terms["one_c_a"], terms["hysteresis_factor"] = (
+            cell.one_c_a,
+            arrhenius(HYSTERESIS_ACTIVATION_ENERGY, temperature_c),
+        )
         terms["current_a"], terms["hysteresis"] = current_a, rows["hysteresis"]
         # the hysteresis at the start of the segment, an unknown, decays with the throughput
         terms["start_h_decay"] = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
