@@ -21,7 +21,7 @@ from bms_estimator.fleet.demo import faulty_packs
 from bms_estimator.fleet.demo.observer import OBSERVED_PACKS, Observer
 from bms_estimator.fleet.demo.processes import LOOPBACK, TIMEOUT_S, Processes, free_port
 from bms_estimator.fleet.demo.progress import Progress
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.process.tasks import until_first_ends
@@ -43,7 +43,7 @@ async def result_lines(nc: Client, observer: Observer, takeover_s: float, lags_b
     """
     counters, compared = observer.counters, max(1, len(observer.errors))
     entries = await read_bucket(nc, subjects.CHECKPOINTS_BUCKET)
-    pointers = [Pointer.model_validate_json(data) for data in entries.values()]
+    pointers = [CheckpointPointer.model_validate_json(data) for data in entries.values()]
     before_s, after_s = (
         max(lags, default=0.0) for lags in (observer.lags_s[:lags_before_kill], observer.lags_s[lags_before_kill:])
     )

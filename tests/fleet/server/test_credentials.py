@@ -21,7 +21,7 @@ from nats.errors import Error as NatsError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.dead_packs import DeadPackReader
 from bms_estimator.fleet.nats.streams import consumer, make_streams
@@ -304,7 +304,7 @@ async def _run_worker(fleet: Fleet) -> None:
         await working
         checkpoints = await reader.jetstream().key_value(subjects.CHECKPOINTS_BUCKET)
         pointers = [await checkpoints.get(key) for key in await checkpoints.keys() if key != "any"]  # of another test
-        assert any(Pointer.model_validate_json(pointer.value or b"").kept for pointer in pointers)
+        assert any(CheckpointPointer.model_validate_json(pointer.value or b"").kept for pointer in pointers)
 
 
 async def test_reader_reads_everything_and_cannot_write(fleet: Fleet) -> None:
