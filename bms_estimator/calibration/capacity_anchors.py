@@ -14,7 +14,7 @@ from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V,
 from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.kernels.cell_model.open_loop import hysteresis
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, arrhenius, on_grid
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, REFERENCE_C, arrhenius, on_grid
 from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
 from bms_estimator.model.charge_count import MIN_GAP_PERIODS, step_charges_as
 from bms_estimator.model.columns import Columns
@@ -175,7 +175,7 @@ def _soc_of_rest(rest: Rest, settings: np.void, hysteresis_mean: float, hysteres
     """Return the SOC by the voltage of a rest, with mean and std of the hysteresis state h at 25 °C."""
     curve = settings["ocv_v"], settings["ocv_slope_v"]
     temperature_c = float(np.nan_to_num(rest.temperature_c, nan=REFERENCE_C))
-    amplitude = arrhenius(HYSTERESIS_J, temperature_c)  # of the hysteresis, relative to 25 °C
+    amplitude = arrhenius(HYSTERESIS_ACTIVATION_ENERGY, temperature_c)  # of the hysteresis, relative to 25 °C
     soc = soc_from_ocv(rest.ocv_v, *curve)
     for _ in range(OFFSET_ITERATIONS):
         hysteresis_v = amplitude * hysteresis_mean * on_grid(soc, settings["hysteresis_v"])

@@ -16,12 +16,12 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
-    GAS_J,
-    HYSTERESIS_J,
-    STRONG_J,
+    GAS_CONSTANT,
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
     TAU_S,
     TREND,
-    WEAK_J,
     weak_share,
 )
 from bms_estimator.kernels.kalman_filter.records import Noise
@@ -139,9 +139,9 @@ def c_header(cell: CellModel) -> str:
         ocv_nodes=curve.soc.size,
         ohm_nodes=ladder.soc.size,
         trend=TREND,
-        weak_k=_float(WEAK_J / GAS_J),
-        strong_k=_float(STRONG_J / GAS_J),
-        hysteresis_k=_float(HYSTERESIS_J / GAS_J),
+        weak_k=_float(LOW_ACTIVATION_ENERGY / GAS_CONSTANT),
+        strong_k=_float(HIGH_ACTIVATION_ENERGY / GAS_CONSTANT),
+        hysteresis_k=_float(HYSTERESIS_ACTIVATION_ENERGY / GAS_CONSTANT),
         hysteresis_soc=_float(Noise().hysteresis_soc),
         tables="\n".join(tables),
     )

@@ -16,12 +16,12 @@ from bms_estimator.conversion.circuit import fill_template, ladder_table, ocv_ta
 from bms_estimator.kernels.cell_model.open_loop import MIN_CAPACITANCE
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
-    GAS_J,
-    HYSTERESIS_J,
+    GAS_CONSTANT,
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
     REFERENCE_C,
-    STRONG_J,
     TAU_S,
-    WEAK_J,
 )
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.arrays import Floats
@@ -66,9 +66,9 @@ def _ladder(cell: CellModel) -> str:
         weak_ohm=_matrix(table.weak_ohm),
         strong_ohm=_matrix(table.strong_ohm),
         tau_s=TAU_S,
-        weak_j=WEAK_J,
-        strong_j=STRONG_J,
-        gas_j=GAS_J,
+        weak_j=LOW_ACTIVATION_ENERGY,
+        strong_j=HIGH_ACTIVATION_ENERGY,
+        gas_j=GAS_CONSTANT,
     )
 
 
@@ -103,9 +103,13 @@ class ModelConstants(Strict):
     time_constant_s: tuple[float, ...] = Field(
         default=TAU_S, description="time constants of the ladder's RC pairs [s]; the capacitance is this divided by R"
     )
-    weak_j_per_mol: float = Field(default=WEAK_J, description="activation energy of weak_ohm [J/mol]")
-    strong_j_per_mol: float = Field(default=STRONG_J, description="activation energy of strong_ohm [J/mol]")
-    hysteresis_j_per_mol: float = Field(default=HYSTERESIS_J, description="activation energy of hysteresis_v [J/mol]")
+    weak_j_per_mol: float = Field(default=LOW_ACTIVATION_ENERGY, description="activation energy of weak_ohm [J/mol]")
+    strong_j_per_mol: float = Field(
+        default=HIGH_ACTIVATION_ENERGY, description="activation energy of strong_ohm [J/mol]"
+    )
+    hysteresis_j_per_mol: float = Field(
+        default=HYSTERESIS_ACTIVATION_ENERGY, description="activation energy of hysteresis_v [J/mol]"
+    )
     hysteresis_soc: float = Field(
         default=Noise().hysteresis_soc,  # a default of the filter that every cell uses
         description="change of SOC after which 1/e of the way to the other OCV branch remains",

@@ -91,6 +91,7 @@ class FleetWorkers:
                     twice.add(partition)
                 holders[partition] = index
         lags = [_max_lag_s(received) for received in alive.values()]
+        refused = {each.partition for received in alive.values() for each in received[-1].heartbeat.refused}
         return {
             "workers": [
                 _worker_overview(self._by_worker[name], now_s, name in alive) for name in sorted(self._by_worker)
@@ -98,17 +99,12 @@ class FleetWorkers:
             "holders": holders,
             "unheld": [n for n, index in enumerate(holders) if index == NO_WORKER],
             "twice": sorted(twice),
-            "refused": sorted({n for n in _refused(alive) if n < self.partitions and holders[n] == NO_WORKER}),
+            "refused": sorted({n for n in refused if n < self.partitions and holders[n] == NO_WORKER}),
             "lag_s": max((lag for lag in lags if lag is not None), default=None),
         }
 
     def _alive(self, now_s: float) -> dict[str, deque[_Received]]:
         return {name: received for name, received in self._by_worker.items() if received[-1].at_s >= now_s - ALIVE_S}
-
-
-def _refused(workers: dict[str, deque[_Received]]) -> set[int]:
-    """Return the partitions that a worker refuses."""
-    return {each.partition for received in workers.values() for each in received[-1].heartbeat.refused}
 
 
 def _max_lag_s(received: deque[_Received]) -> float | None:

@@ -5,11 +5,11 @@ import numpy as np
 from bms_estimator.kernels.accumulators.history import HYSTERESIS_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
-    HYSTERESIS_J,
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
     RESISTANCES,
-    STRONG_J,
     TAUS,
-    WEAK_J,
     arrhenius,
     on_grid,
     resistances,
@@ -99,7 +99,14 @@ def cell_voltage(p: Record, s: Record, current_a: float, ohm_factor: float, cels
         celsius: Temperature of the cell [degC].
         ohm: Resistances by the cell file [ohm], shape (RESISTANCES,); written.
     """
-    resistances(s.soc, p.weak_ohm, p.strong_ohm, arrhenius(WEAK_J, celsius), arrhenius(STRONG_J, celsius), ohm)
+    resistances(
+        s.soc,
+        p.weak_ohm,
+        p.strong_ohm,
+        arrhenius(LOW_ACTIVATION_ENERGY, celsius),
+        arrhenius(HIGH_ACTIVATION_ENERGY, celsius),
+        ohm,
+    )
     drop_v = current_a * ohm[0]
     for k in range(BRANCHES):
         drop_v += ohm[1 + k] * s.x_a[k]
@@ -117,7 +124,7 @@ def open_circuit(p: Record, s: Record, celsius: float) -> float:
     ocv_v = p.ocv_v[j] + (position - j) * (p.ocv_v[j + 1] - p.ocv_v[j])
     ocv_v += (s.soc - 1.0) * p.ocv_slope_v[-1] if s.soc > 1.0 else 0.0
     h = FAST_FRACTION * s.hysteresis[0] + (1.0 - FAST_FRACTION) * s.hysteresis[1]
-    ocv_v += h * arrhenius(HYSTERESIS_J, celsius) * on_grid(s.soc, p.hysteresis_v)
+    ocv_v += h * arrhenius(HYSTERESIS_ACTIVATION_ENERGY, celsius) * on_grid(s.soc, p.hysteresis_v)
     ocv_v += (celsius - 25.0) * on_grid(s.soc, p.per_kelvin_v)
     return float(max(ocv_v + COLLAPSE_V * min(s.soc, 0.0), 0.0))
 

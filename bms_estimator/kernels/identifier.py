@@ -36,7 +36,11 @@ from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     write_equivalent_circuit,
 )
 from bms_estimator.kernels.kalman_filter.frozen_sensor import detect_frozen_input
-from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD, update_hypotheses, weakest_cell_soc_std
+from bms_estimator.kernels.kalman_filter.hypotheses import (
+    MAX_STD_OF_ONE_HYPOTHESIS,
+    update_hypotheses,
+    weakest_cell_soc_std,
+)
 from bms_estimator.kernels.kalman_filter.input_checks import (
     UNUSABLE,
     coast_without_voltage,
@@ -47,7 +51,7 @@ from bms_estimator.kernels.kalman_filter.input_checks import (
     update_input_faults,
 )
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
-from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD, detect_current_step
+from bms_estimator.kernels.kalman_filter.step_resistance import VARYING, detect_current_step
 from bms_estimator.kernels.kalman_filter.window import WINDOW_S, add_to_window, integrate_current
 from bms_estimator.kernels.start import restart_filter
 from bms_estimator.model.arrays import Record
@@ -90,7 +94,7 @@ def identifier_step(
     unknown_soc = f.window.unknown_as / p.filter.capacity_as
     if gap and dt_s >= p.filter.unmeasured_s:
         f.window.gap = LONG_GAP
-    may_hide_charge = f.window.gap == LONG_GAP or (f.window.gap and unknown_soc > MAX_SINGLE_STD)
+    may_hide_charge = f.window.gap == LONG_GAP or (f.window.gap and unknown_soc > MAX_STD_OF_ONE_HYPOTHESIS)
     # the SOC after such a gap needs a voltage: if the gap ended without one, the filter restarts at the first voltage after it
     if measured and may_hide_charge and not c.suspects & UNUSABLE:
         restart_filter(s, p, f.window.time_s, current_a, voltage_v)
@@ -103,7 +107,7 @@ def identifier_step(
         detect_current_step(f, p.filter, s.observer.voltage_age_s, change_a, voltage_v)
         add_to_window(f, current_a, voltage_v)
     else:
-        f.step.phase = UNHELD  # without the voltage, the current step determines no R_s
+        f.step.phase = VARYING  # without the voltage, the current step determines no R_s
     if f.window.time_s >= WINDOW_S and f.window.samples > 0:
         update_from_window(s, p)
     s.observer.soc = f.soc

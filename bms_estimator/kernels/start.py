@@ -24,7 +24,7 @@ from bms_estimator.kernels.kalman_filter.hypotheses import (
 )
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, limit_soc_std, merge_all
-from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
+from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.temperature import is_temperature, update_arrhenius_factors
 from bms_estimator.kernels.kalman_filter.window import add_to_window, prepare_transition, reset_window
 from bms_estimator.kernels.observer.learning_law import initialize_learning, initialize_states_at_rest
@@ -51,7 +51,7 @@ def restart_filter(s: Record, p: Record, gap_s: float, current_a: float, voltage
     """Re-initialize the SOC after a gap of ``gap_s`` [s]; infinite if unknown. The window contains a gap of known duration."""
     f = s.filter
     begin_segment(s.history, gap_s, f.window.charge_as, f.window.unknown_as)
-    f.current_a, f.step.phase = current_a, UNHELD
+    f.current_a, f.step.phase = current_a, VARYING
     update_arrhenius_factors(f)
     if gap_s < p.filter.unmeasured_s:  # too short for a charge or an exchange of the pack
         soc_std = math.sqrt(f.soc_std**2 + (f.window.unknown_as / p.filter.capacity_as) ** 2)

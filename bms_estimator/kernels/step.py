@@ -12,7 +12,7 @@ from bms_estimator.kernels.current_check import accept_waiting, is_doubtful, max
 from bms_estimator.kernels.identifier import identifier_step
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
-from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
+from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.window import widen_by_interpolation
 from bms_estimator.kernels.observer.learning_law import learning_step
 from bms_estimator.kernels.observer.observer import count_charge, initialize, observer_step
@@ -138,7 +138,7 @@ def process_sample(
         s.learning.settle_s = s.series_resistance.settle_s = settle_s
     if not 0.0 <= dt_s < math.inf:  # the clock was set back, or the duration of the gap is unknown
         o.current_a = s.filter.current_a = current_a
-        s.filter.step.phase = UNHELD
+        s.filter.step.phase = VARYING
         if new_clock:
             restart_after_unknown_gap(s, p, current_a, voltage_v, temperature_c)
         else:

@@ -107,7 +107,7 @@ def _ln_values(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
 
     All are linear functions of the unknowns, except the total resistance, whose derivatives are those at the minimum.
     """
-    cell, u, x, n = equations.model.cell, equations.u, minimum.x, equations.intervals.count
+    cell, u, x, n = equations.model.cell, equations.unknowns, minimum.x, equations.intervals.count
     ohm = cell.series * cell.resistances(RESISTANCE_SOC, AT_REFERENCE, AT_REFERENCE)[0]
     group_ohm = np.bincount(RESISTANCE_GROUPS, ohm) * np.exp(x[u.ln_r])
     ln_r = np.zeros((n, u.size))  # derivatives of what all resistances have in common

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model.rc_ladder import (
-    GAS_J,
+    GAS_CONSTANT,
     GRID,
     REFERENCE_C,
     RESISTANCES,
@@ -110,7 +110,7 @@ class CellCurves:
 def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:
     """Return the Arrhenius factor on a resistance with an activation energy [J/mol]; 1 at 25 C."""
     inverse_k = 1.0 / (temperature_c + ZERO_C_K) - 1.0 / (REFERENCE_C + ZERO_C_K)
-    return np.asarray(np.exp(energy_j / GAS_J * inverse_k))
+    return np.asarray(np.exp(energy_j / GAS_CONSTANT * inverse_k))
 
 
 @dataclass(frozen=True)

@@ -84,10 +84,10 @@ class Equations:
         self.rows = rows
         self.intervals = Intervals(cell, rows)
         self.links = Links.of(cell, self.intervals)
-        self.u = Unknowns.of(self.intervals.count, self.intervals.segments)
+        self.unknowns = Unknowns.of(self.intervals.count, self.intervals.segments)
         """Positions of the unknowns in their vector."""
-        self.prior = Prior(cell, self.intervals, self.u)
-        self.model = VoltageModel(cell, self.intervals, self.u, reference)
+        self.prior = Prior(cell, self.intervals, self.unknowns)
+        self.model = VoltageModel(cell, self.intervals, self.unknowns, reference)
         self.voltage_v = rows["voltage_v"] / cell.series
         # the rows of one pass together have the weight of one row, because their errors are nearly equal
         self.weight = (rows["duration_s"] > 0.0) / np.sqrt(self.model.variance_v2 * self.intervals.rows_of_pass())
@@ -120,7 +120,7 @@ class Equations:
         """Return residuals and cost at ``x``."""
         p = self.model.predict(x)
         voltage = self.weight * (self.voltage_v - p.voltage_v)
-        reference = (self.known_soc - p.soc[self.known] - self.is_full * x[self.u.full]) / self.known_std
+        reference = (self.known_soc - p.soc[self.known] - self.is_full * x[self.unknowns.full]) / self.known_std
         beyond = (np.minimum(p.soc + BEYOND_SOC, 0.0) + np.maximum(p.soc - 1.0 - BEYOND_SOC, 0.0)) / BEYOND_STD
         link_cost, links = self._link(x)
         deviation = x - self.prior.mean
@@ -150,7 +150,7 @@ class Equations:
         """Return the blocks of known SOCs and of SOCs beyond their tolerated range."""
         columns, values = self.model.soc_derivatives(r.x)
         known, out = self.known, np.flatnonzero(r.beyond)
-        known_columns = np.column_stack([columns[known], np.full(known.size, self.u.full.start)])
+        known_columns = np.column_stack([columns[known], np.full(known.size, self.unknowns.full.start)])
         known_values = np.column_stack([values[known], self.is_full]) / self.known_std[:, None]
         return (
             Block(r.reference, known_columns, known_values),
@@ -163,7 +163,7 @@ class Equations:
         The SOC after a gap has the density of a mixture: normal about the counted SOC, and, with the probability of a hidden
         charge, uniform over 0..1 with a density of 1. The residual is weighted by the probability that no charge was hidden.
         """
-        u, links = self.u, self.links
+        u, links = self.unknowns, self.links
         later, k = links.interval, links.interval - 1
         inverse_q = np.exp(-x[u.ln_q][k])
         drawn = (links.drawn_soc - x[u.offset][k] * links.hours) * inverse_q

@@ -215,8 +215,8 @@ def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
         if abs(shift) > reach:
             continue
         x = equations.prior.mean.copy()
-        x[equations.u.soc] = filter_soc(equations, ln_q) + shift
-        x[equations.u.ln_q] = ln_q
+        x[equations.unknowns.soc] = filter_soc(equations, ln_q) + shift
+        x[equations.unknowns.ln_q] = ln_q
         results.append(x)
     return results
 
@@ -241,7 +241,7 @@ def start_near(equations: Equations, previous: PackFit, curves: Floats) -> Float
         previous: Previous fit.
         curves: One of ``previous.curves``.
     """
-    u = equations.u
+    u = equations.unknowns
     x = equations.prior.mean.copy()
     x[u.curve.start :] = curves
     x[u.ln_q], x[u.offset] = previous.mean[LN_Q], previous.mean[OFFSET]
@@ -270,7 +270,7 @@ def mixture(equations: Equations, minima: list[Minimum]) -> PackFit:
     """Return mean and covariance of the mixture of minima, of which the best is the first."""
     weights = mixture_weights(minima)
     mean, covariance = mixture_moments(weights, [_results(equations, m) for m in minima])
-    u, rows = equations.u, equations.rows
+    u, rows = equations.unknowns, equations.rows
     last = rows[-1]
     x = weights @ np.array([m.x for m in minima])
     shape = NodePosition.of(SOC_GRID, SHAPE_NODES).interpolate(x[u.shape])
@@ -319,7 +319,7 @@ def mixture_moments(weights: Floats, moments: list[tuple[Floats, Floats]]) -> tu
 
 def _results(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
     """Return mean and covariance of the results at one minimum. The results are linear functions of the unknowns."""
-    u, x, model = equations.u, minimum.x, equations.model
+    u, x, model = equations.unknowns, minimum.x, equations.model
     select = np.zeros((CURVE.stop, u.size))
     columns, values = model.soc_derivatives(x)
     select[SOC, columns[-1]] = values[-1]

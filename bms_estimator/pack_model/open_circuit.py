@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.bank_simulation import COLLAPSE_V
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
+    REFERENCE_C,
+)
 from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import (
@@ -52,7 +57,9 @@ class OpenCircuit:
         drops = Overpotential(cell, fit, rows)
         drop_v = drops.at(soc[:, None])[:, 0]
         hysteresis_v = (
-            fit.hysteresis * arrhenius(HYSTERESIS_J, temperature_c) * np.interp(soc, SOC_GRID, cell.hysteresis_v)
+            fit.hysteresis
+            * arrhenius(HYSTERESIS_ACTIVATION_ENERGY, temperature_c)
+            * np.interp(soc, SOC_GRID, cell.hysteresis_v)
         )
         by_temperature_v = (temperature_c - REFERENCE_C) * np.interp(soc, SOC_GRID, cell.per_kelvin_v)
         e_o_v = rows["voltage_v"] / cell.series + drop_v - hysteresis_v * rows["hysteresis"].mean(axis=1)
@@ -73,7 +80,10 @@ class Overpotential:
         weak_ohm = scale * cell.resistances(SOC_GRID, one, 0.0 * one)
         strong_ohm = scale * cell.resistances(SOC_GRID, 0.0 * one, one)
         current_a = np.column_stack([rows["current_a"], rows["x_a"]]) - fit.mean[OFFSET] * cell.one_c_a
-        weak, strong = arrhenius(WEAK_J, rows["temperature_c"]), arrhenius(STRONG_J, rows["temperature_c"])
+        weak, strong = (
+            arrhenius(LOW_ACTIVATION_ENERGY, rows["temperature_c"]),
+            arrhenius(HIGH_ACTIVATION_ENERGY, rows["temperature_c"]),
+        )
         self._grid_v = weak[:, None] * (current_a @ weak_ohm.T) + strong[:, None] * (current_a @ strong_ohm.T)
 
     def at(self, soc: Floats) -> Floats:

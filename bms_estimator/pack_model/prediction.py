@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.accumulators.history import HYSTERESIS_SOC, ROW_SOC
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, STRONG_J, TAUS, TREND, WEAK_J
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
+    REFERENCE_C,
+    TAUS,
+    TREND,
+)
 from bms_estimator.kernels.pack_voltage import MODEL_ROW, RESISTANCE_GROUPS, voltage_derivatives, voltages
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.aging import RESISTANCE, AgingVariance
@@ -81,10 +88,10 @@ class VoltageModel:
     """
 
     def __init__(self, cell: CellCurves, intervals: Intervals, u: Unknowns, reference: Reference) -> None:
-        self.cell, self.u, self.intervals = cell, u, intervals
+        self.cell, self.unknowns, self.intervals = cell, u, intervals
         rows = intervals.rows
         temperature_c: Floats = rows["temperature_c"]
-        weak, strong = arrhenius(WEAK_J, temperature_c), arrhenius(STRONG_J, temperature_c)
+        weak, strong = arrhenius(LOW_ACTIVATION_ENERGY, temperature_c), arrhenius(HIGH_ACTIVATION_ENERGY, temperature_c)
         current_a = np.column_stack([rows["current_a"], rows["x_a"]])
         z = np.clip(reference.soc, 0.0, 1.0)
         ohm = cell.resistances(z, weak, strong)
@@ -96,7 +103,10 @@ class VoltageModel:
             rows["direction"] + 1.0,
         )
         terms["above_25_c_k"], terms["weak"], terms["strong"] = temperature_c - REFERENCE_C, weak, strong
-        terms["one_c_a"], terms["hysteresis_factor"] = cell.one_c_a, arrhenius(HYSTERESIS_J, temperature_c)
+        terms["one_c_a"], terms["hysteresis_factor"] = (
+            cell.one_c_a,
+            arrhenius(HYSTERESIS_ACTIVATION_ENERGY, temperature_c),
+        )
         terms["current_a"], terms["hysteresis"] = current_a, rows["hysteresis"]
         # the hysteresis at the start of the segment, an unknown, decays with the throughput
         terms["start_h_decay"] = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
@@ -122,19 +132,19 @@ class VoltageModel:
 
     def soc(self, x: Floats) -> Floats:
         """Return the SOC of each row."""
-        u, k = self.u, self.intervals.of_row
+        u, k = self.unknowns, self.intervals.of_row
         return np.asarray(x[u.soc][k] - self._drawn_soc(x) * np.exp(-x[u.ln_q][k]))
 
     def soc_derivatives(self, x: Floats) -> Derivatives:
         """Return the derivatives of the SOC of each row by SOC, offset and ln of the capacity of its interval."""
-        u, k = self.u, self.intervals.of_row
+        u, k = self.unknowns, self.intervals.of_row
         inverse_q = np.exp(-x[u.ln_q][k])
         at = np.column_stack([u.soc.start + k, u.offset.start + k, u.ln_q.start + k])
         return at, np.column_stack([np.ones(k.size), self.intervals.hours * inverse_q, self._drawn_soc(x) * inverse_q])
 
     def _drawn_soc(self, x: Floats) -> Floats:
         """Return the true charge since the interval's start, as a fraction of the declared capacity."""
-        offset: Floats = x[self.u.offset][self.intervals.of_row]
+        offset: Floats = x[self.unknowns.offset][self.intervals.of_row]
         return self.intervals.drawn_soc - offset * self.intervals.hours
 
     def predict(self, x: Floats) -> Prediction:
@@ -144,7 +154,7 @@ class VoltageModel:
 
     def _voltages(self, x: Floats, z: Floats) -> Floats:
         """Return the voltages that ``x`` predicts if the rows' SOCs are ``z`` [V]."""
-        return voltages(self.rows, self.cell.table, x, self.u.first, z, self.cell.ocv(z))
+        return voltages(self.rows, self.cell.table, x, self.unknowns.first, z, self.cell.ocv(z))
 
     def derivatives(self, x: Floats, p: Prediction, *, use_file_slope: bool) -> Derivatives:
         """Return the derivatives of the predicted voltages.
@@ -157,7 +167,7 @@ class VoltageModel:
         """
         slope_v = self.cell.slope(p.soc) if use_file_slope else self._slope_v(x, p.soc)
         by_soc = self.soc_derivatives(x)[1] * slope_v[:, None]
-        return voltage_derivatives(self.rows, self.cell.table, x, self.u.first, p.soc, by_soc)
+        return voltage_derivatives(self.rows, self.cell.table, x, self.unknowns.first, p.soc, by_soc)
 
     def _slope_v(self, x: Floats, z: Floats) -> Floats:
         """Return the slope of the predicted voltages over SOC [V per unit SOC], as a secant over the SOC range of a row.

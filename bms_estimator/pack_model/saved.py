@@ -62,7 +62,7 @@ _FIT_RANGES = {
 """Range of each saved field of a fit."""
 _CURVE_UNKNOWNS = CURVE_NODES + DIRECTIONS * DIRECTION_NODES
 """Number of unknowns of the OCV's error and of the error by direction."""
-BANK = "bank_"
+BANK_PREFIX = "bank_"
 """Prefix of the arrays of the first discharges of a bank and of the fit after them."""
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -122,7 +122,7 @@ def history_arrays(history: History, fit: PackFit | None) -> dict[str, NDArray[A
     arrays = {"rows": history.rows, "weak_cell_times": weak_s, **curve_arrays(fit)}
     if history.first is not None:
         arrays["bank_rows"] = history.first.rows
-        arrays |= {BANK + name: array for name, array in curve_arrays(history.first.fit).items()}
+        arrays |= {BANK_PREFIX + name: array for name, array in curve_arrays(history.first.fit).items()}
     if fit is not None:
         arrays |= {"row_elapsed_s": fit.row_elapsed_s, "row_soc": fit.row_soc}
         arrays["curves"] = np.array(fit.curves[:SAVED_MINIMA]).reshape(min(len(fit.curves), SAVED_MINIMA), -1)
@@ -142,7 +142,7 @@ def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
 
 def _first_discharges(arrays: Arrays) -> ReferenceDischarges | None:
     """Return the first discharges of a bank; None if none were saved."""
-    fit = fit_of_curves({name: arrays[BANK + name] for name in FIT_SHAPES if BANK + name in arrays})
+    fit = fit_of_curves({name: arrays[BANK_PREFIX + name] for name in FIT_SHAPES if BANK_PREFIX + name in arrays})
     return None if fit is None else ReferenceDischarges(_rows(arrays, "bank_rows"), fit)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
-from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD
+from bms_estimator.kernels.kalman_filter.hypotheses import MAX_STD_OF_ONE_HYPOTHESIS
 from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import SOC as FIT_SOC
@@ -325,7 +325,7 @@ def min_filter_std(fitted: PackFit, rows: NDArray[np.void]) -> float:
         rows: Fitted rows, shape (n,), dtype HISTORY_ROW.
     """
     std = math.sqrt(fitted.covariance[FIT_SOC, FIT_SOC])
-    if std <= MAX_SINGLE_STD or throughput(rows) >= MIN_THROUGHPUT_SOC:
+    if std <= MAX_STD_OF_ONE_HYPOTHESIS or throughput(rows) >= MIN_THROUGHPUT_SOC:
         return 0.0
     is_known = bool(np.isfinite(rows["reference_soc"]).any())
     has_gap = bool(rows["segment"][0] != rows["segment"][-1])

@@ -63,7 +63,7 @@ def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ())
     now, damping = equations.residuals(start), FIRST_DAMPING
     normal = equations.normal_equations(now)
     for _ in range(MAX_ITERATIONS):
-        trial = equations.residuals(now.x + step(normal, damping, equations.u))
+        trial = equations.residuals(now.x + step(normal, damping, equations.unknowns))
         decrease = now.cost - trial.cost
         if decrease > 0.0:
             now, damping = trial, max(LESS_DAMPING * damping, MIN_DAMPING)
@@ -78,12 +78,12 @@ def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ())
         return None
     # slopes of the fitted correction would count as information on the SOC
     precision = equations.normal_equations(now, use_file_slope=True).a
-    return Minimum(now.x, now.cost, cholesky(precision, equations.u.soc.start))
+    return Minimum(now.x, now.cost, cholesky(precision, equations.unknowns.soc.start))
 
 
 def is_same(equations: Equations, now: Residuals, other: Minimum) -> bool:
     """Return True if cost and SOCs equal those of another minimum."""
-    difference = np.abs(now.x[equations.u.soc] - other.x[equations.u.soc]).max()
+    difference = np.abs(now.x[equations.unknowns.soc] - other.x[equations.unknowns.soc]).max()
     return abs(now.cost - other.cost) < SAME_COST and bool(difference < SAME_SOC)
 
 

@@ -18,7 +18,7 @@ from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.sensor_faults import BoardResets
-from bms_estimator.telemetry.cells import cell_faults
+from bms_estimator.telemetry.cells import cell_alarm_inputs
 
 if TYPE_CHECKING:
     from bms_estimator.estimator.cell_estimator import CellDeviations
@@ -96,7 +96,7 @@ class AlarmMonitor:
                 cells_fault=cells_fault,
                 clock_fault=self._source.clock_fault,
                 lost=self._lost,
-                cell_faults=cell_faults(cells) if cells is not None and is_new else None,
+                cell_alarm_inputs=cell_alarm_inputs(cells) if cells is not None and is_new else None,
                 weak_cell_std=slow_fit.weak_cell_std if slow_fit else math.nan,
             )
         self._last_sample_s = now_s

@@ -31,7 +31,7 @@ CELL_COLUMNS = np.dtype(
 """Columns about the cells in a table of estimates; NaN before the first estimate of the cells."""
 
 
-class CellFault(NamedTuple):
+class CellAlarmInput(NamedTuple):
     """Input of one alarm: the largest value of all cells, and the faulty cells."""
 
     value: float
@@ -42,30 +42,30 @@ class CellFault(NamedTuple):
     """Index and fault of each faulty cell. They show whether the faults have changed; ``texts`` also change with the measured values."""
 
 
-NO_CELL_FAULT = CellFault(0.0)
+NO_FAULTY_CELL = CellAlarmInput(0.0)
 
 
-class CellFaults(NamedTuple):
+class CellAlarmInputs(NamedTuple):
     """Inputs of the alarms about the cells at one time, each over all cells."""
 
     at_s: float
     """Time on the samples' clock [s]."""
-    short: CellFault
+    short: CellAlarmInput
     """Largest lower bound of a cell's self-discharge current [A]; 0 if no self-discharge is significant."""
-    reading: CellFault
+    reading: CellAlarmInput
     """Error of a reading [V]."""
 
 
-def cell_faults(cells: CellDeviations) -> CellFaults:
+def cell_alarm_inputs(cells: CellDeviations) -> CellAlarmInputs:
     """Return the faults of the cells as inputs of the alarms."""
     proven_a = cells.proven_self_discharge_a
     i = int(np.argmax(proven_a))
     short_text = f"cell {i + 1} discharges itself by {cells.self_discharge_a[i]:.3g} A more than the other cells"
     faulty = [i for i, fault in enumerate(cells.fault) if fault]
-    return CellFaults(
+    return CellAlarmInputs(
         cells.at_s,
-        CellFault(max(float(proven_a[i]), 0.0), (short_text,)) if proven_a[i] > 0.0 else NO_CELL_FAULT,
-        CellFault(
+        CellAlarmInput(max(float(proven_a[i]), 0.0), (short_text,)) if proven_a[i] > 0.0 else NO_FAULTY_CELL,
+        CellAlarmInput(
             float(cells.reading_error_v.max()),
             tuple(_reading_text(cells, i) for i in faulty),
             tuple((i, cells.fault[i]) for i in faulty),

@@ -16,7 +16,7 @@ from rich.table import Table
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import CURVE_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, REFERENCE_C
-from bms_estimator.kernels.kalman_filter.hypotheses import MAX_SINGLE_STD, spawn_hypotheses
+from bms_estimator.kernels.kalman_filter.hypotheses import MAX_STD_OF_ONE_HYPOTHESIS, spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.mixture import mixture_moments
 from bms_estimator.kernels.kalman_filter.records import SOC
 from bms_estimator.model.arrays import Floats
@@ -140,7 +140,7 @@ def score_without(part: str, cell: CellModel, samples: SampleBlock, truth: Float
 
 def restart_with_one_hypothesis(state: np.void, settings: np.void, start_soc: float) -> None:
     """Replace all hypotheses by one at the initial SOC, with the standard deviation that the SOC has over all of them."""
-    spawn_hypotheses(state, settings, start_soc, MAX_SINGLE_STD)
+    spawn_hypotheses(state, settings, start_soc, MAX_STD_OF_ONE_HYPOTHESIS)
     state["covariance"][0, SOC, SOC] = settings["soc_std"] ** 2
     mixture_moments(state)
 

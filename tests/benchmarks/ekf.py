@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import ocv
-from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HIGH_ACTIVATION_ENERGY, LOW_ACTIVATION_ENERGY, TAU_S, arrhenius
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
@@ -100,7 +100,9 @@ def five_branches(weak_ohm: Floats, strong_ohm: Floats) -> tuple[Floats, Floats]
 
     weak, strong = share_between_nearest(weak_ohm), share_between_nearest(strong_ohm)
     middle = len(weak) // 2
-    cold_ohm = weak[middle] * arrhenius(WEAK_J, COLD_C) + strong[middle] * arrhenius(STRONG_J, COLD_C)
+    cold_ohm = weak[middle] * arrhenius(LOW_ACTIVATION_ENERGY, COLD_C) + strong[middle] * arrhenius(
+        HIGH_ACTIVATION_ENERGY, COLD_C
+    )
     ln_ratio = np.log(np.maximum(cold_ohm / np.maximum(weak[middle] + strong[middle], 1e-9), 1.0))
     return weak + strong, ln_ratio / math.log(arrhenius(1.0, COLD_C))
 

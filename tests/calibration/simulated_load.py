@@ -60,7 +60,7 @@ def wrong_start(factor_ohm=1.7, factor_farad=0.6):
     return CellModel.model_validate(table)
 
 
-GAS_J = 8.314462618
+GAS_CONSTANT = 8.314462618
 """Gas constant [J/(mol K)]."""
 LADDER = Ladder(
     soc=(0.0, 0.2, 1.0),
@@ -83,7 +83,7 @@ def ladder_capture(current_a, temperature_c, *, soc=0.98, noise_v=0.5e-3, seed=0
     true_soc = soc - discharged_as / (3600.0 * TRUTH.cell.capacity_ah)
     inverse_kelvin_difference = 1.0 / (temperature_c + 273.15) - 1.0 / 298.15
     # Activation energies of the weak and the strong dependence on temperature [J/mol].
-    factors = [np.exp(energy_j / GAS_J * inverse_kelvin_difference) for energy_j in (12e3, 45e3)]
+    factors = [np.exp(energy_j / GAS_CONSTANT * inverse_kelvin_difference) for energy_j in (12e3, 45e3)]
     mean_a = 0.5 * (current_a[1:] + current_a[:-1])
     drop_v = np.zeros(time_s.size)
     for k, tau_s in enumerate((0.0, 1.0, 6.0, 30.0, 120.0, 500.0, 2000.0)):  # the first is the series resistance

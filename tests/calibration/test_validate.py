@@ -7,7 +7,7 @@ from bms_estimator.calibration.soc_errors import soc_errors
 from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, arrhenius
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
@@ -47,7 +47,7 @@ def test_effects_of_temperature_and_hysteresis_on_the_ocv_are_subtracted_once():
     """A discharge at -15 C is validated with a file that contains hysteresis and temperature coefficient."""
     samples = ladder_capture(steps(), -15.0)
     # 40 K below 25 C, and the branch after discharge.
-    samples["voltage_v"] -= 40.0 * 2e-4 + 0.01 * arrhenius(HYSTERESIS_J, -15.0)
+    samples["voltage_v"] -= 40.0 * 2e-4 + 0.01 * arrhenius(HYSTERESIS_ACTIVATION_ENERGY, -15.0)
     grid_v = ocv_grid(TRUTH)[0]
     soc = np.linspace(0.0, 1.0, grid_v.size)
     ocv = TableOcv(

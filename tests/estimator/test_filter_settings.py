@@ -9,7 +9,13 @@ from bms_estimator import Estimator
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, SLOW_DIFFUSION, SOC_GRID, ladder_of_branches
 from bms_estimator.estimator.identified_parameters import present_elements
 from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.kernels.cell_model.rc_ladder import GRID, RESISTANCES, STRONG_J, WEAK_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    GRID,
+    HIGH_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
+    RESISTANCES,
+    arrhenius,
+)
 from bms_estimator.model.cell import Ladder, TableOcv, load_cell
 from bms_estimator.settings.observer import IdentifierSettings
 
@@ -51,7 +57,9 @@ def test_resistances_of_two_rc_pairs_grow_in_the_cold_as_in_measured_cells() -> 
     cold_ratio = {}
     for soc in (0.5, 0.1):
         weak, strong = (float(p[name][round(soc * (GRID - 1))].sum()) for name in ("weak_ohm", "strong_ohm"))
-        cold_ratio[soc] = (weak * arrhenius(WEAK_J, 0.0) + strong * arrhenius(STRONG_J, 0.0)) / (weak + strong)
+        cold_ratio[soc] = (
+            weak * arrhenius(LOW_ACTIVATION_ENERGY, 0.0) + strong * arrhenius(HIGH_ACTIVATION_ENERGY, 0.0)
+        ) / (weak + strong)
     assert 2.0 < cold_ratio[0.5] < 2.8
     assert 1.2 * cold_ratio[0.5] < cold_ratio[0.1] < 4.6
 

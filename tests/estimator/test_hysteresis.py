@@ -7,7 +7,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, r_s
 from bms_estimator.kernels.cell_model.open_loop import hysteresis
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, arrhenius
 from bms_estimator.kernels.kalman_filter.records import HYST
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
@@ -107,5 +107,7 @@ def test_hysteresis_grows_in_the_cold() -> None:
             predicted_v[h, celsius] = f["voltage_v"]
     difference_v = {celsius: predicted_v[1.0, celsius] - predicted_v[-1.0, celsius] for celsius in (-15.0, 25.0)}
     assert difference_v[25.0] == pytest.approx(HYSTERESIS_V, rel=0.01)
-    assert difference_v[-15.0] / difference_v[25.0] == pytest.approx(arrhenius(HYSTERESIS_J, -15.0), rel=0.01)
+    assert difference_v[-15.0] / difference_v[25.0] == pytest.approx(
+        arrhenius(HYSTERESIS_ACTIVATION_ENERGY, -15.0), rel=0.01
+    )
     assert 1.5 < difference_v[-15.0] / difference_v[25.0] < 1.8

@@ -46,7 +46,7 @@ class Tenant:
 
     def token(self, pack: str) -> str:
         """Return the token of an edge."""
-        return credentials.edge_token(self._keys, NAME, pack, datetime.now(UTC) - timedelta(minutes=1))
+        return credentials.edge_tokens(self._keys, NAME, [pack], datetime.now(UTC) - timedelta(minutes=1))[pack]
 
     def edge(self, pack: str) -> aiomqtt.Client:
         """Return the MQTT client of an edge."""

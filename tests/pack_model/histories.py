@@ -100,7 +100,7 @@ def equations_of(cell: CellCurves, rows: np.ndarray) -> Equations:
 
 def unknowns_of(equations: Equations, truth: Truth) -> np.ndarray:
     """Return the vector of unknowns of a history of one segment."""
-    x, u, links = equations.prior.mean.copy(), equations.u, equations.links
+    x, u, links = equations.prior.mean.copy(), equations.unknowns, equations.links
     x[u.ln_q], x[u.offset], x[u.ln_r] = truth.ln_q, truth.offset_c, truth.ln_r
     x[u.soc] = truth.soc
     for k, drawn_soc, hours in zip(links.interval, links.drawn_soc, links.hours, strict=True):
@@ -137,7 +137,7 @@ def reference_row(rows: np.ndarray, soc: float, std: float) -> np.ndarray:
 
 def random_unknowns(equations: Equations, seed: int = 1) -> np.ndarray:
     """Return plausible unknowns: the SOCs of a true history, with random values of all other unknowns."""
-    rng, u = np.random.default_rng(seed), equations.u
+    rng, u = np.random.default_rng(seed), equations.unknowns
     x = unknowns_of(equations, Truth(ln_q=0.05, offset_c=0.002, ln_r=(0.2, -0.1, 0.3)))
     for part, std in spreads(u):
         x[part] += rng.normal(0.0, std, x[part].size)

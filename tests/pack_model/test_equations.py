@@ -35,7 +35,7 @@ def analytical(equations: Equations, x: np.ndarray) -> np.ndarray:
     """Return the derivatives of all voltages by all unknowns, shape (n, unknowns)."""
     model = equations.model
     columns, values = model.derivatives(x, model.predict(x), use_file_slope=False)
-    jacobian = np.zeros((columns.shape[0], equations.u.size))
+    jacobian = np.zeros((columns.shape[0], equations.unknowns.size))
     np.add.at(jacobian, (np.arange(columns.shape[0])[:, None], columns), values)
     return jacobian
 
@@ -53,7 +53,7 @@ def numerical(equations: Equations, x: np.ndarray, j: int, step: float) -> np.nd
 )
 def test_derivatives_by_unknowns_that_do_not_move_the_soc(equations: Equations, kind: str, step: float) -> None:
     x = random_unknowns(equations)
-    jacobian, part = analytical(equations, x), getattr(equations.u, kind)
+    jacobian, part = analytical(equations, x), getattr(equations.unknowns, kind)
     for j in range(part.start, part.stop):
         np.testing.assert_allclose(jacobian[:, j], numerical(equations, x, j, step), rtol=1e-6, atol=1e-8)
 
@@ -62,8 +62,8 @@ def test_derivatives_by_unknowns_that_do_not_move_the_soc(equations: Equations, 
 def test_derivative_by_soc_is_the_secant_over_the_soc_range_of_a_row(equations: Equations, shift: float) -> None:
     """The shifts move rows beyond SOC 0 and 1, where the fitted curves are constant."""
     x = random_unknowns(equations)
-    x[equations.u.soc] += shift
-    jacobian, u = analytical(equations, x), equations.u
+    x[equations.unknowns.soc] += shift
+    jacobian, u = analytical(equations, x), equations.unknowns
     for j in range(u.soc.start, u.soc.stop):
         np.testing.assert_allclose(jacobian[:, j], numerical(equations, x, j, ROW_SOC / 2), rtol=1e-9, atol=1e-9)
 
@@ -72,8 +72,8 @@ def test_derivative_by_soc_is_the_secant_over_the_soc_range_of_a_row(equations: 
 def test_derivatives_by_offset_and_capacity(equations: Equations, kind: str) -> None:
     """They contain the secant over SOC, so that single rows deviate from the derivative at a point."""
     x = random_unknowns(equations)
-    x[equations.u.curve] = x[equations.u.direction] = 0.0
-    jacobian, part = analytical(equations, x), getattr(equations.u, kind)
+    x[equations.unknowns.curve] = x[equations.unknowns.direction] = 0.0
+    jacobian, part = analytical(equations, x), getattr(equations.unknowns, kind)
     for j in range(part.start, part.stop):
         by_difference = numerical(equations, x, j, 1e-4)
         assert np.linalg.norm(jacobian[:, j] - by_difference) < 0.05 * np.linalg.norm(by_difference)
@@ -85,12 +85,12 @@ def test_gradient_of_the_cost(equations: Equations) -> None:
     SOC, offset and capacity are left out, because their derivatives are secants.
     """
     x = random_unknowns(equations)
-    x[equations.u.soc] += 0.15
+    x[equations.unknowns.soc] += 0.15
     r = equations.residuals(x)
     assert np.any(r.beyond > 0.0)
     assert np.any(np.abs(r.voltage) > 3.0)
     b = equations.normal_equations(r).b
-    u = equations.u
+    u = equations.unknowns
     for kind in ("full", *LINEAR, *EXPONENTIAL):
         part = getattr(u, kind)
         for j in range(part.start, part.stop):
@@ -111,7 +111,7 @@ def test_cost_of_a_soc_beyond_its_range_decreases_along_the_step(equations: Equa
 @pytest.mark.parametrize("shift", [0.0, 0.08, -0.08, 0.15])
 def test_minimum_is_below_its_start_and_its_neighbors(equations: Equations, shift: float) -> None:
     start = unknowns_of(equations, Truth(ln_r=(0.3, 0.3, 0.3)))
-    start[equations.u.soc] += shift
+    start[equations.unknowns.soc] += shift
     minimum = minimize(equations, start)
     assert minimum is not None
     assert minimum.cost < equations.residuals(start).cost
@@ -132,7 +132,7 @@ def test_a_known_minimum_is_not_found_again(equations: Equations) -> None:
 def test_normal_equations_sum_the_products_of_all_derivatives(equations: Equations) -> None:
     """The sum has the prior, the voltages and the known SOC. No SOC is beyond its range."""
     r = equations.residuals(unknowns_of(equations, Truth()))
-    x, p, u = r.x, r.prediction, equations.u
+    x, p, u = r.x, r.prediction, equations.unknowns
     columns, values = equations.model.derivatives(x, p, use_file_slope=False)
     known, soc_values = equations.known, equations.model.soc_derivatives(x)[1]
     parts = [(columns, equations.weight[:, None] * values), (r.links.columns, r.links.values)]
@@ -168,7 +168,7 @@ def test_cholesky_factor_of_sparse_columns(segments: int) -> None:
     history = equations_of(cell, np.concatenate(parts))
     a = history.normal_equations(history.residuals(history.prior.mean)).a
     expected = np.linalg.cholesky(np.tril(a) + np.tril(a, -1).T)
-    factor = cholesky(a, history.u.soc.start)
+    factor = cholesky(a, history.unknowns.soc.start)
     np.testing.assert_allclose(np.tril(factor), expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAUS, WEAK_J
+from bms_estimator.kernels.cell_model.rc_ladder import HIGH_ACTIVATION_ENERGY, LOW_ACTIVATION_ENERGY, TAUS
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.pack.pack import Pack
@@ -68,7 +68,9 @@ def test_load_that_continues_over_a_gap_is_no_exchange(hours: float) -> None:
 def drop_by_earlier_load(rows: np.ndarray, load_c: float) -> np.ndarray:
     """Return the voltage drop that the RC pairs keep from a constant load before the first row [V]."""
     cell, temperature_c = cell_curves(), rows["temperature_c"]
-    ohm = cell.resistances(rows["soc"], arrhenius(WEAK_J, temperature_c), arrhenius(STRONG_J, temperature_c))[:, 1:]
+    ohm = cell.resistances(
+        rows["soc"], arrhenius(LOW_ACTIVATION_ENERGY, temperature_c), arrhenius(HIGH_ACTIVATION_ENERGY, temperature_c)
+    )[:, 1:]
     middle_s = rows["settled_s"] + 0.5 * rows["duration_s"]
     kept_a = load_c * cell.one_c_a * np.exp(-middle_s[:, None] / TAUS)
     return np.asarray(cell.series * (ohm * kept_a).sum(axis=1))

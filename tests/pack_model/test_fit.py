@@ -92,7 +92,7 @@ def test_resistances_that_rise_more_near_empty_do_not_move_the_soc() -> None:
     rows = with_voltages(cell, measured_rows(cell, days=2), truth)
     equations = equations_of(cell, rows)
     x = unknowns_of(equations, truth)
-    x[equations.u.shape.start] = np.log(2.0)
+    x[equations.unknowns.shape.start] = np.log(2.0)
     rows["voltage_v"] = equations.model.predict(x).voltage_v * cell.series
     error = fit(cell, rows).row_soc - rows["soc"]
     assert np.sqrt(np.mean(error**2)) < 0.015

@@ -38,7 +38,7 @@ def minimum(cell: CellCurves, rows: np.ndarray) -> tuple[float, float]:
     equations = equations_of(cell, rows)
     found = minimize(equations, unknowns_of(equations, TRUTH))
     assert found is not None
-    last = equations.u.soc.stop - 1
+    last = equations.unknowns.soc.stop - 1
     select = np.zeros((1, found.x.size))
     select[0, last] = 1.0
     return float(found.x[last]), float(np.sqrt(found.covariance_of(select)[0, 0]))
@@ -74,7 +74,7 @@ def test_most_of_the_offset_is_constant() -> None:
     """The offset has the same std on each day, and changes by a tenth of this std from day to day."""
     cell = cell_curves()
     equations = equations_of(cell, history(cell))
-    part = equations.u.offset
+    part = equations.unknowns.offset
     covariance = np.linalg.inv(equations.prior.precision[part, part])
     std_c = cell.offset_std_a / cell.one_c_a
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std_c, rtol=0.01)

@@ -28,7 +28,7 @@ from bms_estimator.protocols.base.probe_check import probe_block
 from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault, CellFaults
+from bms_estimator.telemetry.cells import NO_FAULTY_CELL, CellAlarmInput, CellAlarmInputs
 from tests.telemetry.alarm_captures import (
     PACK,
     WALL_S,
@@ -368,10 +368,10 @@ def make_evaluator(alarms: dict[str, Any] | None = None, cell: CellModel = PACK)
 def test_text_of_a_raised_reading_fault_stays_while_only_its_numbers_change() -> None:
     alarms = make_evaluator({"cell_sensor_fault": {"delay_s": 0.0}}, load_cell("nmc", 10.0).pack(3, 1))
     for at_s, text in enumerate(["cell 2 is off by 0.1 V", "cell 2 is off by 0.1 V", "cell 2 is off by 0.2 V"]):
-        fault = CellFault(0.1, (text,), ((1, ReadingFault.OFFSET),))
-        faults, samples = CellFaults(float(at_s), NO_CELL_FAULT, fault), np.zeros(1, SAMPLE)
+        fault = CellAlarmInput(0.1, (text,), ((1, ReadingFault.OFFSET),))
+        faults, samples = CellAlarmInputs(float(at_s), NO_FAULTY_CELL, fault), np.zeros(1, SAMPLE)
         samples["time_s"] = at_s
-        alarms.evaluate(samples, NO_TRACE, NO_CELLS, WALL_S, cell_faults=faults)
+        alarms.evaluate(samples, NO_TRACE, NO_CELLS, WALL_S, cell_alarm_inputs=faults)
     (text,) = [alarm.text for alarm in alarms.report() if alarm.name == "cell_sensor_fault"]
     assert "cell 2 is off by 0.1 V" in text
 

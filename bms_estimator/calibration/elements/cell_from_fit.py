@@ -10,7 +10,7 @@ from bms_estimator.calibration.elements.ladder_prior import GENERIC_STD, ocv_err
 from bms_estimator.calibration.elements.replay_score import MAX_STEP_S
 from bms_estimator.calibration.ocv.overpotential import arrhenius, linear_interpolation_matrix, overpotential
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES, STRONG_J
+from bms_estimator.kernels.cell_model.rc_ladder import HIGH_ACTIVATION_ENERGY, RESISTANCES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
 
@@ -66,7 +66,9 @@ def voltage_rms_v(cell: CellModel, run: Run) -> float:
     e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
     error_v = run.load.voltage_v - e_o + overpotential(cell, run.load_with_temperature, run.soc)
     weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, MAX_STEP_S)
-    weight *= ((run.soc > MIN_RMS_SOC) & ~run.load.mismatched) / arrhenius(0.5 * STRONG_J, run.temperature_c) ** 2
+    weight *= ((run.soc > MIN_RMS_SOC) & ~run.load.mismatched) / arrhenius(
+        0.5 * HIGH_ACTIVATION_ENERGY, run.temperature_c
+    ) ** 2
     return float(np.sqrt((weight * error_v**2).sum() / max(weight.sum(), 1e-12)))
 
 

@@ -3,7 +3,12 @@
 import numpy as np
 
 from bms_estimator.calibration.elements.initial_elements import InitialElements
-from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, STRONG_J, WEAK_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    HIGH_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
+    REFERENCE_C,
+    arrhenius,
+)
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, generic_cells, load_cell
 
@@ -68,7 +73,10 @@ def scaled_generic_ladder(
     if rests is None:
         return ladder
     weak_ohm, strong_ohm = np.array(ladder.weak_ohm), np.array(ladder.strong_ohm)
-    total_ohm = arrhenius(WEAK_J, temperature_c) * weak_ohm + arrhenius(STRONG_J, temperature_c) * strong_ohm
+    total_ohm = (
+        arrhenius(LOW_ACTIVATION_ENERGY, temperature_c) * weak_ohm
+        + arrhenius(HIGH_ACTIVATION_ENERGY, temperature_c) * strong_ohm
+    )
     mid_soc_ohm = np.array([np.interp(0.5, ladder.soc, row) for row in total_ohm])
     # index 0 is the series resistance, the others are the RC pairs
     scale = np.full(mid_soc_ohm.size, (rests.r_ts_ohm + rests.r_tl_ohm) / mid_soc_ohm[1:].sum())

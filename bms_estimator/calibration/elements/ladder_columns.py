@@ -13,7 +13,12 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from bms_estimator.calibration.ocv.overpotential import arrhenius, linear_interpolation_matrix
-from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES, STRONG_J, WEAK_J
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    HIGH_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
+    REFERENCE_C,
+    RESISTANCES,
+)
 from bms_estimator.model.arrays import Floats
 
 SOC_NODES = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.65, 0.85, 1.0])
@@ -44,7 +49,7 @@ def model_rows(soc: Floats, temperature_c: Floats, currents: Floats) -> Floats:
         [
             correction_at(soc),
             linear_interpolation_matrix(soc, KELVIN_NODES) * (temperature_c - REFERENCE_C)[:, None],
-            -drop_rows * arrhenius(WEAK_J, temperature_c)[:, None],
-            -drop_rows * arrhenius(STRONG_J, temperature_c)[:, None],
+            -drop_rows * arrhenius(LOW_ACTIVATION_ENERGY, temperature_c)[:, None],
+            -drop_rows * arrhenius(HIGH_ACTIVATION_ENERGY, temperature_c)[:, None],
         ]
     )

@@ -10,7 +10,7 @@ from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.calibration.ocv.slow_curve import GRID
 from bms_estimator.calibration.ocv.source import OcvSources, Source
 from bms_estimator.calibration.ocv.table_fit import NODES
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, REFERENCE_C, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, REFERENCE_C, arrhenius
 from bms_estimator.model.arrays import Floats
 
 REST_SHARE = 0.7
@@ -50,7 +50,7 @@ def _from_reference(temperature_c: float) -> float:
 
 def hysteresis_factor(temperature_c: float) -> float:
     """Return the hysteresis at a temperature relative to that at 25 C; 1 for NaN."""
-    return float(arrhenius(HYSTERESIS_J, float(np.nan_to_num(temperature_c, nan=REFERENCE_C))))
+    return float(arrhenius(HYSTERESIS_ACTIVATION_ENERGY, float(np.nan_to_num(temperature_c, nan=REFERENCE_C))))
 
 
 def measured_share(

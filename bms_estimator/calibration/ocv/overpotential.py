@@ -7,7 +7,14 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
 from bms_estimator.kernels.cell_model.open_loop import branch_currents_from, hysteresis, two_branches
-from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GAS_J, HYSTERESIS_J, REFERENCE_C, STRONG_J, WEAK_J
+from bms_estimator.kernels.cell_model.rc_ladder import (
+    BRANCHES,
+    GAS_CONSTANT,
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
+    REFERENCE_C,
+)
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv
@@ -21,7 +28,8 @@ BLOCK_SAMPLES = 1 << 16
 def arrhenius(energy_j: float, temperature_c: Floats) -> Floats:
     """Return ``kernels.cell_model.rc_ladder.arrhenius`` for an array of temperatures."""
     return np.asarray(
-        np.exp(energy_j / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / (REFERENCE_C + KELVIN))), dtype=np.float64
+        np.exp(energy_j / GAS_CONSTANT * (1.0 / (temperature_c + KELVIN) - 1.0 / (REFERENCE_C + KELVIN))),
+        dtype=np.float64,
     )
 
 
@@ -63,7 +71,7 @@ def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
         block = slice(begin, begin + BLOCK_SAMPLES)
         if ocv.hysteresis_v is not None:
             half_width_v = np.interp(soc[block], ocv.soc, ocv.hysteresis_v)
-            added_v[block] *= half_width_v * arrhenius(HYSTERESIS_J, temperature_c[block])
+            added_v[block] *= half_width_v * arrhenius(HYSTERESIS_ACTIVATION_ENERGY, temperature_c[block])
         if ocv.per_kelvin_v is not None:
             per_kelvin_v = np.interp(soc[block], ocv.soc, ocv.per_kelvin_v)
             added_v[block] += per_kelvin_v * (temperature_c[block] - REFERENCE_C)
@@ -84,7 +92,10 @@ def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Fl
         linear_interpolation_matrix(soc, np.array(ladder.soc)) @ np.array(part[first:]).sum(axis=0)
         for part in (ladder.weak_ohm, ladder.strong_ohm)
     )
-    ohm = arrhenius(WEAK_J, temperature_c) * weak_ohm + arrhenius(STRONG_J, temperature_c) * strong_ohm
+    ohm = (
+        arrhenius(LOW_ACTIVATION_ENERGY, temperature_c) * weak_ohm
+        + arrhenius(HIGH_ACTIVATION_ENERGY, temperature_c) * strong_ohm
+    )
     return np.asarray(current_a * ohm)
 
 
@@ -100,6 +111,8 @@ def ladder_overpotential(ladder: Ladder, load: CleanCapture, soc: Floats, temper
         node_weights = linear_interpolation_matrix(soc[block], np.array(ladder.soc))
         weak_v = ((node_weights @ np.array(ladder.weak_ohm).T) * currents).sum(axis=1)
         strong_v = ((node_weights @ np.array(ladder.strong_ohm).T) * currents).sum(axis=1)
-        weak, strong = (arrhenius(energy_j, temperature_c[block]) for energy_j in (WEAK_J, STRONG_J))
+        weak, strong = (
+            arrhenius(energy_j, temperature_c[block]) for energy_j in (LOW_ACTIVATION_ENERGY, HIGH_ACTIVATION_ENERGY)
+        )
         drop_v[block] = weak * weak_v + strong * strong_v
     return drop_v

@@ -13,7 +13,7 @@ from bms_estimator.cli.options.table import print_table
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer
+    from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, CheckpointPointer
 
 DAY_COLUMNS: tuple[str, ...] = ("day", "partitions", "MB")
 COLUMNS = ("kind", "written (UTC)", "sequence", "format", "increments", "MB")
@@ -68,7 +68,7 @@ def restore(
         typer.echo(f"partition {number}: returned to the checkpoint of {_time(info)} UTC")
 
 
-def _day_rows(pointers: "Iterable[Pointer]") -> list[tuple[object, ...]]:
+def _day_rows(pointers: "Iterable[CheckpointPointer]") -> list[tuple[object, ...]]:
     """Return a row for each day, the newest first."""
     from bms_estimator.fleet.worker.checkpoint.admin_changes import day_of  # noqa: PLC0415 - NATS is optional
 
@@ -79,7 +79,7 @@ def _day_rows(pointers: "Iterable[Pointer]") -> list[tuple[object, ...]]:
     return [(day, len(sizes[day]), _megabytes(sum(sizes[day]))) for day in sorted(sizes, reverse=True)]
 
 
-def _rows(pointer: "Pointer") -> list[tuple[object, ...]]:
+def _rows(pointer: "CheckpointPointer") -> list[tuple[object, ...]]:
     """Return a row for each checkpoint of a partition."""
     kinds = [*zip(("last", "previous"), pointer.kept, strict=False), *(("daily", info) for info in pointer.daily)]
     return [
@@ -103,7 +103,7 @@ def _megabytes(size: int) -> str:
     return f"{size / 1e6:,.1f}"
 
 
-async def _read(address: ServerAddress) -> "dict[int, Pointer]":
+async def _read(address: ServerAddress) -> "dict[int, CheckpointPointer]":
     from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
     from bms_estimator.fleet.worker.checkpoint.admin_changes import read_pointers  # noqa: PLC0415
 

@@ -21,8 +21,8 @@ from bms_estimator.fleet.demo import faulty_packs
 from bms_estimator.fleet.demo.observer import OBSERVED_PACKS, Observer
 from bms_estimator.fleet.demo.processes import LOOPBACK, TIMEOUT_S, Processes, free_port
 from bms_estimator.fleet.demo.progress import Progress
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
-from bms_estimator.fleet.nats.stream_reader import read_stream
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
+from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.process.tasks import until_first_ends
 
@@ -42,7 +42,8 @@ async def result_lines(nc: Client, observer: Observer, takeover_s: float, lags_b
         lags_before_kill: Number of ``observer.lags_s`` before the kill.
     """
     counters, compared = observer.counters, max(1, len(observer.errors))
-    pointers = await _pointers(nc)
+    entries = await read_bucket(nc, subjects.CHECKPOINTS_BUCKET)
+    pointers = [CheckpointPointer.model_validate_json(data) for data in entries.values()]
     before_s, after_s = (
         max(lags, default=0.0) for lags in (observer.lags_s[:lags_before_kill], observer.lags_s[lags_before_kill:])
     )
@@ -60,16 +61,6 @@ async def result_lines(nc: Client, observer: Observer, takeover_s: float, lags_b
         ("checkpoints: daily, stored for 30 days", f"{sum(len(each.daily) for each in pointers):,}"),
     )
     return [f"   {name:45}{value:>10}" for name, value in rows]
-
-
-async def _pointers(nc: Client) -> list[Pointer]:
-    """Return the pointers to the checkpoints of all partitions that have one."""
-    prefix = f"$KV.{subjects.CHECKPOINTS_BUCKET}."
-    newest = dict[str, bytes]()
-    async for batch in read_stream(nc, f"KV_{subjects.CHECKPOINTS_BUCKET}", f"{prefix}*"):
-        newest |= {message.subject.removeprefix(prefix): message.data for message in batch}
-    keys = map(pointer_key, range(subjects.PARTITIONS))
-    return [Pointer.model_validate_json(newest[key]) for key in keys if newest.get(key)]
 
 
 SPEED = 10.0

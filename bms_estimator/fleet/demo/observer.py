@@ -50,14 +50,9 @@ class Observer:
         }
 
     @property
-    def owned_partitions(self) -> set[int]:
-        """Partitions that live workers own."""
-        return {number for heartbeat in self.alive.values() for number in heartbeat.partitions}
-
-    @property
     def all_partitions_owned(self) -> bool:
         """True if live workers own all partitions with packs. Workers also claim partitions without packs."""
-        return self.owned_partitions >= self.partitions
+        return self.partitions.issubset(number for heartbeat in self.alive.values() for number in heartbeat.partitions)
 
     @property
     def processed(self) -> int:

@@ -215,7 +215,7 @@ class Backfill:
         if self._stop.is_set():
             await self._store.send_remaining()
         else:
-            await until_first_ends(self._store.publisher.wait_until_sent(), self._stop.wait())
+            await until_first_ends(self._store.publisher.idle.wait(), self._stop.wait())
 
     async def _add_pack(self, pack: str) -> None:
         while not self._stop.is_set():

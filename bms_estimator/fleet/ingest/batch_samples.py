@@ -102,7 +102,7 @@ class BatchReader:
         except OverflowError:
             raise BatchError("a number is too large") from None
         samples = to_samples(raw, layout)
-        if self._sign_of(layout) == "charge_positive":
+        if (self._current_sign or layout.dialect.current_sign) == "charge_positive":
             samples["current_a"] *= -1.0
         remove_implausible_temperatures(samples)
         return BatchSamples(samples, cells_v)
@@ -150,9 +150,6 @@ class BatchReader:
         if unit is None or len(cells) > 1:
             raise UserError(f"column {', '.join(cells)}: must be one column cells_v or cells_mv")
         return Layout(layout.dialect, roles), Column(header.index(cells[0]), cells[0], unit)
-
-    def _sign_of(self, layout: Layout) -> CurrentSign:
-        return self._current_sign or layout.dialect.current_sign or "discharge_positive"
 
 
 def _reason(error: UserError) -> str:

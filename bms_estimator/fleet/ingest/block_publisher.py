@@ -36,6 +36,7 @@ class BlockPublisher:
         sent: Id of the last acknowledged block. The caller sets it to 0 to send all blocks again.
         published: Number of acknowledged blocks since the start, with repetitions.
         resends: Number of requests of workers to send blocks again.
+        idle: Set while the server has acknowledged all blocks in the database.
     """
 
     def __init__(self, nc: Client, database: Database, sent: int) -> None:
@@ -43,19 +44,15 @@ class BlockPublisher:
         self._js = nc.jetstream(publish_async_max_pending=2 * PAGE_BLOCKS)
         self.sent, self.published, self.resends = sent, 0, 0
         self._stored = asyncio.Event()
-        self._idle = asyncio.Event()
+        self.idle = asyncio.Event()
         self._requested: dict[str, int] = {}  # first block to send again, by pack
         self._last_resend: dict[str, tuple[int, float]] = {}  # first block and time, by pack
         self._trouble = ""
 
     def notify(self) -> None:
         """Announce new blocks in the database."""
-        self._idle.clear()
+        self.idle.clear()
         self._stored.set()
-
-    async def wait_until_sent(self) -> None:
-        """Wait until the server has acknowledged all blocks in the database."""
-        await self._idle.wait()
 
     def resend(self, pack: str, number: int) -> None:
         """Send a block and all later blocks of a pack again, unless this happened less than ``RESEND_S`` ago."""
@@ -87,7 +84,7 @@ class BlockPublisher:
                 continue
             self._trouble = ""
             if not self._stored.is_set():
-                self._idle.set()
+                self.idle.set()
                 await self._stored.wait()
 
     async def _send_next(self) -> bool:

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import time
 import traceback
 from collections import Counter
 from pathlib import Path
@@ -199,7 +200,7 @@ class Ingest:
             if pack not in self._bucket.packs:
                 log.info("a pack was removed from the table; its stored blocks are removed", pack=pack)
                 self._store.remove(pack)
-        self._store.cut_overdue()
+        self._store.cut(time.monotonic())  # blocks of packs that send nothing more
         await self._save()
         await self._check_stream()
         if self._telemetry.warning:

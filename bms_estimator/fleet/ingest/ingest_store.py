@@ -150,13 +150,9 @@ class IngestStore:
         self._confirmed.pop(pack, None)
         self._removed.add(pack)
 
-    def cut_overdue(self) -> None:
-        """Complete blocks that have been open for too long, because their packs send nothing more."""
-        self._open_blocks.cut(time.monotonic())
-
-    def cut(self) -> None:
-        """Complete all open blocks."""
-        self._open_blocks.cut()
+    def cut(self, now_s: float = math.inf) -> None:
+        """Complete open blocks; see ``OpenBlocks.cut``."""
+        self._open_blocks.cut(now_s)
 
     async def save(self, stream: str, sequence: int) -> None:
         """Write all changes to disk. Repeat until the disk accepts them.
@@ -198,7 +194,7 @@ class IngestStore:
         """Wait until the server has all stored blocks, but at most ``HANDOVER_S``. The next run sends the others."""
         try:
             async with asyncio.timeout(HANDOVER_S):
-                await self.publisher.wait_until_sent()
+                await self.publisher.idle.wait()
         except TimeoutError:
             log.warning("not all blocks could be sent; the next run sends the others")
 

@@ -2,9 +2,7 @@
 
 import asyncio
 import contextlib
-import fcntl
-import os
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.folder_lock import lock_folder
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, close, connect, error_text
 from bms_estimator.fleet.nats.streams import make_telemetry_stream, partitions_of
@@ -62,7 +61,7 @@ async def open_ingest(
     Raises:
         UserError: An option cannot be used, or another process uses the folder.
     """
-    with lock_folder(options.folder):
+    with lock_folder(options.folder, ".lock", "another `fleet ingest` uses it; end it", mode=0o700):
         starting = asyncio.ensure_future(_start(options))
         await until_first_ends(asyncio.wait([starting]), stop.wait())
         if not starting.done():
@@ -118,26 +117,3 @@ async def _claim(nc: Client) -> None:
 
 async def _ignore(_: Msg) -> None:
     """Ignore a request of another process, which needs no reply."""
-
-
-@contextlib.contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Lock the folder against other processes.
-
-    Raises:
-        TemporaryError: Another process uses the folder, or the folder cannot be written.
-    """
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        descriptor = os.open(folder / ".lock", os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
-    except OSError as error:
-        raise TemporaryError(f"--folder {folder}: cannot be written: {error.strerror}") from error
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    except BlockingIOError:
-        raise TemporaryError(
-            f"--folder {folder}: another `fleet ingest` uses it; end it, or choose another folder"
-        ) from None
-    finally:
-        os.close(descriptor)

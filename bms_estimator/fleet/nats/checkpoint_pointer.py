@@ -29,7 +29,7 @@ class CheckpointInfo(BaseModel):
         return (self.object, *self.increments)
 
 
-class Pointer(BaseModel):
+class CheckpointPointer(BaseModel):
     """List of a partition's checkpoints, and the claim of the worker that owns the partition."""
 
     model_config = ConfigDict(frozen=True)

@@ -156,8 +156,14 @@ async def make_telemetry_stream(nc: Client, max_bytes: int) -> None:
     response = await _retry(_request, nc, f"STREAM.INFO.{subjects.RAW_STREAM}", {})
     if "error" in response:
         raise _no_raw_stream()
-    limits = {"max_bytes": max_bytes, "max_msg_size": MAX_BATCH_BYTES, "discard": "new", "allow_direct": True}
-    stream = _stream(subjects.TELEMETRY_STREAM, subjects.telemetry(), **limits)
+    stream = _stream(
+        subjects.TELEMETRY_STREAM,
+        subjects.telemetry(),
+        max_bytes=max_bytes,
+        max_msg_size=MAX_BATCH_BYTES,
+        discard="new",
+        allow_direct=True,
+    )
     await _retry(_ensure_stream, nc, stream | {"num_replicas": response["config"]["num_replicas"]})
 
 
@@ -177,14 +183,6 @@ def max_blocks_of_pack(raw_bytes: int) -> int:
 
 def _raw_stream(partitions: int, max_bytes: int, age_s: float, max_pack_blocks: int) -> dict[str, Any]:
     source, destination = subjects.mapping(partitions)
-    limits = {
-        "max_bytes": max_bytes,
-        "max_age": _ns(age_s),
-        "max_msg_size": MAX_BLOCK_BYTES,
-        "max_msgs_per_subject": max_pack_blocks,
-        "discard": "old",
-        "allow_direct": True,
-    }
     return _stream(
         subjects.RAW_STREAM,
         subjects.raw("*"),
@@ -193,45 +191,55 @@ def _raw_stream(partitions: int, max_bytes: int, age_s: float, max_pack_blocks: 
         subjects.fit(),
         subject_transform={"src": source, "dest": destination},
         metadata={PARTITIONS_KEY: str(partitions)},
-        **limits,
+        max_bytes=max_bytes,
+        max_age=_ns(age_s),
+        max_msg_size=MAX_BLOCK_BYTES,
+        max_msgs_per_subject=max_pack_blocks,
+        discard="old",
+        allow_direct=True,
     )
 
 
 def _hours_stream(raw_bytes: int) -> dict[str, Any]:
-    limits = {
-        "max_bytes": round(HOURS_FRACTION * raw_bytes),
-        "max_age": _ns(HOURS_AGE_S),
-        "discard": "old",
-        "allow_direct": True,
-    }
-    return _stream(subjects.HOURS_STREAM, subjects.hours(), duplicate_window=_ns(DUPLICATES_S), **limits)
+    return _stream(
+        subjects.HOURS_STREAM,
+        subjects.hours(),
+        duplicate_window=_ns(DUPLICATES_S),
+        max_bytes=round(HOURS_FRACTION * raw_bytes),
+        max_age=_ns(HOURS_AGE_S),
+        discard="old",
+        allow_direct=True,
+    )
 
 
 def _dead_stream(raw_bytes: int) -> dict[str, Any]:
-    limits = {
-        "max_bytes": round(DEAD_FRACTION * raw_bytes),
-        "max_age": _ns(DEAD_AGE_S),
-        "max_msgs_per_subject": 1,
-        "discard": "old",
-        "allow_direct": True,
-    }
-    return _stream(subjects.DEAD_STREAM, subjects.dead(), **limits)
+    return _stream(
+        subjects.DEAD_STREAM,
+        subjects.dead(),
+        max_bytes=round(DEAD_FRACTION * raw_bytes),
+        max_age=_ns(DEAD_AGE_S),
+        max_msgs_per_subject=1,
+        discard="old",
+        allow_direct=True,
+    )
 
 
 def _fit_streams(history_bytes: int) -> list[dict[str, Any]]:
     """Return the streams of histories and of requests for fits. A pack has at most one waiting request."""
-    history = {
-        "max_bytes": history_bytes,
-        "max_msgs_per_subject": HISTORY_PACK_MESSAGES,
-        "discard": "old",
-        "allow_direct": True,
-        "allow_rollup_hdrs": True,
-    }
-    requests = {"max_msgs_per_subject": 1, "discard": "old", "retention": "workqueue"}
-    return [
-        _stream(subjects.HISTORY_STREAM, subjects.history(), duplicate_window=_ns(DUPLICATES_S), **history),
-        _stream(subjects.FITS_STREAM, subjects.fit_request(), **requests),
-    ]
+    history = _stream(
+        subjects.HISTORY_STREAM,
+        subjects.history(),
+        duplicate_window=_ns(DUPLICATES_S),
+        max_bytes=history_bytes,
+        max_msgs_per_subject=HISTORY_PACK_MESSAGES,
+        discard="old",
+        allow_direct=True,
+        allow_rollup_hdrs=True,
+    )
+    requests = _stream(
+        subjects.FITS_STREAM, subjects.fit_request(), max_msgs_per_subject=1, discard="old", retention="workqueue"
+    )
+    return [history, requests]
 
 
 def _bucket_streams(states_bytes: int) -> list[dict[str, Any]]:

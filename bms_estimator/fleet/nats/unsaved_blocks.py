@@ -15,7 +15,7 @@ from nats.js.kv import KeyValue
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer, pointer_key
 
 WARNING_SHARE = 0.5
 """Share above which operators are warned."""
@@ -127,7 +127,7 @@ def _time_s(message: RawStreamMsg, now_s: float) -> float:
 async def _saved_sequence(bucket: KeyValue, partition: int) -> int:
     """Return the sequence number of the last message in a partition's last checkpoint; 0 without a checkpoint."""
     try:
-        pointer = Pointer.model_validate_json((await bucket.get(pointer_key(partition))).value or b"")
+        pointer = CheckpointPointer.model_validate_json((await bucket.get(pointer_key(partition))).value or b"")
     except (KeyNotFoundError, ValidationError):
         return 0
     return pointer.kept[0].sequence if pointer.kept else 0

@@ -23,7 +23,7 @@ from bms_estimator.model.one_of import OneOf
 from bms_estimator.model.pack_model import PackModel, load_model
 from bms_estimator.protocols.registry import DEVICES
 from bms_estimator.settings.observer import IdentifierSettings, IdentifierValues
-from bms_estimator.settings.pack import DeviceName, PackSettings, PackValues, Settings
+from bms_estimator.settings.pack import PackSettings, PackValues, Settings
 from bms_estimator.settings.sensor import GainStd, SensorSettings
 
 CELL_NAME = r"^[A-Za-z0-9_-]{1,80}$"
@@ -69,17 +69,6 @@ class PackSpec(IdentifierValues, PackValues, _CellName):
     period_s: Positive | None = Field(default=None, description="interval between two samples; default: 1 s")
 
 
-class PackRow(PackSpec):
-    """Row of one pack."""
-
-    pack: DeviceName = Field(description="name of the pack in topics: 1 to 64 letters, digits, _ and -")
-
-    @property
-    def spec(self) -> PackSpec:
-        """Specification of the pack: the row without the name."""
-        return PackSpec.model_validate(self.model_dump(exclude={"pack"}, exclude_unset=True))
-
-
 COLUMNS = ("pack", *PackSpec.model_fields)
 """Columns of a table in written order."""
 
@@ -105,10 +94,8 @@ def decode_row(data: bytes) -> PackSpec:
 
 
 def settings_of(row: PackSpec) -> Settings:
-    """Return the settings of a pack; a row without a name has the default name."""
+    """Return the settings of a pack, with the default name."""
     values = row.model_dump(exclude_none=True)
-    if isinstance(row, PackRow):
-        values["name"] = row.pack
     values.setdefault("fit_interval_s", FIT_INTERVAL_S)
     return Settings.model_validate(
         {

@@ -16,6 +16,7 @@ from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.page.page_server import STATIC as SHARED
 from bms_estimator.page.web_server import File, WebServer
+from bms_estimator.process.tasks import end
 from bms_estimator.settings.page import PageSettings
 
 STEP_S = 2.0
@@ -81,9 +82,7 @@ async def fleet_page(
         try:
             yield page.url
         finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await end(*tasks)
 
 
 async def _send_overviews(view: FleetView, latest: LatestValues, step_s: float) -> None:

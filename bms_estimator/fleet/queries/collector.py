@@ -5,9 +5,7 @@ A row is acknowledged as soon as its file is on disk. The server redelivers it u
 
 import asyncio
 import contextlib
-import fcntl
 import math
-import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,6 +21,7 @@ from nats.js.errors import NotFoundError
 from pydantic import ValidationError
 
 from bms_estimator.edge.subjects import HOURS_STREAM, PACKS_BUCKET
+from bms_estimator.fleet.folder_lock import lock_folder
 from bms_estimator.fleet.hour_row import HOUR_S, Hour
 from bms_estimator.fleet.nats.bucket_reader import BucketReader
 from bms_estimator.fleet.nats.stream_reader import StreamError
@@ -219,20 +218,7 @@ def only_collector(folder: Path) -> Iterator[None]:
     Raises:
         TemporaryError: Another collector writes there, or the folder cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder / ".collector", os.O_CREAT | os.O_RDWR, 0o644)
-    except OSError as error:
-        raise TemporaryError(f"--folder {folder}: cannot be written: {error.strerror}") from error
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise TemporaryError(
-                f"--folder {folder}: another collector writes there; end it, or choose another folder"
-            ) from None
+    with lock_folder(folder, ".collector", "another collector writes there; end it"):
         for each in (folder, folder / QUARANTINE_FOLDER):
             remove_unfinished(each)
         yield
-    finally:
-        os.close(descriptor)

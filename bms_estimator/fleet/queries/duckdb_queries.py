@@ -243,7 +243,8 @@ def open_database(
         valid_files = {day: files for day, files in files.items() if first <= day.name <= last}
         _create_hours_view(database, valid_files)
         # without an end, because a server whose clock was ahead received the rows of the last days
-        _create_quarantined_view(database, {day: files for day, files in quarantined.items() if first <= day.name})
+        late = [str(file) for day, day_files in quarantined.items() if first <= day.name for file in day_files]
+        _read_files(database, late).create_view("quarantined")
         _create_listed_packs(database, folder)
         yield database, present
 
@@ -336,11 +337,11 @@ def _day_name(hour: int) -> str:
     return day_folder(Path(), datetime.fromtimestamp(hour * HOUR_S, UTC).date()).name
 
 
-def _create_quarantined_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
-    """Create the view ``quarantined`` with the rows of packs with a wrong clock."""
-    names = [str(file) for day_files in files.values() for file in day_files]
-    read = database.read_parquet(names, union_by_name=True, hive_partitioning=False) if names else None
-    (database.table("all_columns") if read is None else read).create_view("quarantined")
+def _read_files(database: duckdb.DuckDBPyConnection, names: list[str]) -> duckdb.DuckDBPyRelation:
+    """Return the rows of files; without files, a relation without rows."""
+    if not names:
+        return database.table("all_columns")
+    return database.read_parquet(names, union_by_name=True, hive_partitioning=False)
 
 
 def _create_listed_packs(database: duckdb.DuckDBPyConnection, folder: Path) -> None:
@@ -364,12 +365,12 @@ def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path,
         (merged if is_merged else unmerged).extend(str(file) for file in day_files)
     database.register("all_columns", SCHEMA.empty_table())  # because files of other versions may lack some columns
     for name, paths in (("merged_rows", merged), ("unmerged_rows", unmerged)):
-        read = database.read_parquet(paths, union_by_name=True, hive_partitioning=False) if paths else None
-        if read is not None and not {"pack", "hour"} <= set(read.columns):
+        read = _read_files(database, paths)
+        if not {"pack", "hour"} <= set(read.columns):
             raise UserError(
                 f"{Path(paths[0]).parent}: its files lack the columns pack and hour: they are not from `fleet collect`"
             )
-        (database.table("all_columns") if read is None else read).create_view(name)
+        read.create_view(name)
     database.execute("CREATE TEMP VIEW rows AS SELECT * FROM all_columns UNION ALL BY NAME SELECT * FROM unmerged_rows")
     database.execute("CREATE TEMP VIEW stored AS SELECT * FROM rows UNION ALL BY NAME SELECT * FROM merged_rows")
     database.execute(f"CREATE TEMP VIEW valid_rows AS {VALID_ROWS}")

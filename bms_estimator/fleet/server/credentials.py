@@ -56,7 +56,7 @@ def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: date
         accounts[tenant.public] = jwt_claims.account(operator, tenant)
         _write_users(folder / name, tenant.public, now)
     claims = Accounts(jwt_claims.operator(operator, system.public), system.public, accounts)
-    _write(folder / CLAIMS, json.dumps(vars(claims), indent=1).encode())
+    write_file(folder / CLAIMS, json.dumps(vars(claims), indent=1).encode())
     return claims
 
 
@@ -71,11 +71,6 @@ def read_accounts(folder: Path) -> Accounts:
         return Accounts(**json.loads(_read(path, _MAX_CLAIMS_BYTES)))
     except (ValueError, TypeError):
         raise UserError(f"{path}: not a claims file of a fleet: copy it from the node that has the keys") from None
-
-
-def edge_token(folder: Path, tenant: str, pack: str, now: datetime, expires: datetime | None = None) -> str:
-    """Return the token of one edge. Arguments and errors are those of ``edge_tokens``."""
-    return edge_tokens(folder, tenant, [pack], now, expires)[pack]
 
 
 def edge_tokens(
@@ -110,10 +105,10 @@ def write_tokens(path: Path, tokens: Mapping[str, str]) -> None:
     """
     if path.suffix == ".csv":
         rows = "".join(f"{pack},{token}\n" for pack, token in tokens.items())
-        _write(path, f"pack,token\n{rows}".encode())
+        write_file(path, f"pack,token\n{rows}".encode())
         return
     for pack, token in tokens.items():
-        _write(path / f"{pack}.token", token.encode())
+        write_file(path / f"{pack}.token", token.encode())
 
 
 def credentials_file(folder: Path, tenant: str, role: Role) -> Path:
@@ -145,13 +140,13 @@ def _write_users(folder: Path, account: str, now: datetime) -> None:
         signer = _read_key(folder / f"{role.value}.nk")
         token = jwt_claims.user(signer, account, role, role.value, now)
         key = jwt_claims.user_key(signer, role, role.value)
-        _write(path, token.encode() if role in BEARERS else jwt_claims.credentials(token, key))
+        write_file(path, token.encode() if role in BEARERS else jwt_claims.credentials(token, key))
 
 
 def _key(path: Path, prefix: int) -> Key:
     """Read a key file; create it with a new key of ``prefix`` if it is missing."""
     if not path.exists():
-        _write(path, jwt_claims.new_key(prefix).seed)
+        write_file(path, jwt_claims.new_key(prefix).seed)
     return _read_key(path)
 
 
@@ -171,7 +166,12 @@ def _read(path: Path, max_bytes: int) -> bytes:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _write(path: Path, content: bytes) -> None:
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file, readable by its owner only.
+
+    Raises:
+        TemporaryError: The file cannot be written.
+    """
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         write_private(path, content)

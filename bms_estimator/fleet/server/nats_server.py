@@ -18,6 +18,7 @@ import structlog
 from nats.errors import Error as NatsError
 
 from bms_estimator.fleet.nats.streams import NoAnswerError
+from bms_estimator.fleet.server.credentials import write_file
 from bms_estimator.fleet.server.disk_space import available_bytes
 from bms_estimator.fleet.server.local_client import scheme
 from bms_estimator.fleet.server.metrics_endpoint import metrics_endpoint
@@ -26,9 +27,9 @@ from bms_estimator.fleet.server.nats_config import Node, configuration
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check_node_disk, check_tls_files, node_of
 from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
-from bms_estimator.model.errors import TemporaryError, UserError
+from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import ends_with_us, find_server
-from bms_estimator.process.private_file import write_private
+from bms_estimator.process.tasks import end
 from bms_estimator.settings.fleet import FleetSettings
 
 OTHER_FILES = 1000
@@ -97,7 +98,7 @@ async def _serve_until_restart(
     node = node_of(place, spec)
     if node.tls:
         check_tls_files(node.tls)
-    _write(place.folder / CONFIGURATION, configuration(node))
+    write_file(place.folder / CONFIGURATION, configuration(node).encode())
     async with (
         NodeWatch(place) as watch,
         metrics_endpoint(spec.settings.server.metrics, node, watch),
@@ -117,10 +118,7 @@ async def _serve_until_restart(
             code = await ended
             is_restart = needs_restart.done() and not end_requested.is_set()
         finally:
-            tasks = (streams_ready, supervising, needs_restart)
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            await end(streams_ready, supervising, needs_restart)
         if is_restart:
             return None
         return 0 if end_requested.is_set() else code
@@ -164,7 +162,7 @@ async def _supervise(
             node = node_of(place, spec)
             async with asyncio.timeout(RELOAD_TIMEOUT_S):
                 varz_before = await wait_for_monitor(node, "varz", bool)
-                _write(place.folder / CONFIGURATION, configuration(node))
+                write_file(place.folder / CONFIGURATION, configuration(node).encode())
                 process.send_signal(signal.SIGHUP)
                 await wait_for_monitor(node, "varz", functools.partial(_has_reloaded, varz_before))
             await make_all_streams(place, spec, report)
@@ -227,11 +225,3 @@ async def _make_ready(place: NodeLocation, spec: ServerSpec, pid: int, report: C
 
 def _has_reloaded(before: Mapping[str, object], varz: Mapping[str, object]) -> bool:
     return varz.get("config_load_time") not in (None, before.get("config_load_time"))
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_private(path, text.encode())
-    except OSError as error:
-        raise TemporaryError(f"{path}: cannot be written: {error.strerror}") from error

@@ -26,7 +26,7 @@ from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIE
 from bms_estimator.telemetry.alarms.message import AlarmMessage as AlarmContent
 from bms_estimator.telemetry.alarms.message import RaisedAlarm, alarm_payload
 from bms_estimator.telemetry.alarms.sensor_faults import PROBE_TEXT, WRONG_CLOCK_TEXT
-from bms_estimator.telemetry.cells import cell_faults
+from bms_estimator.telemetry.cells import cell_alarm_inputs
 from bms_estimator.telemetry.health import identifier_counters, last_anchor, last_change, suspicions
 
 
@@ -182,7 +182,7 @@ class PackAlarms:
             yield from (LOSS_TEXTS[quantity] for q, quantity in enumerate(QUANTITIES) if lost >> q & 1)
             yield from self._input_faults()
         if cells is not None and name in ("cell_short", "cell_sensor_fault"):
-            faults = cell_faults(cells)
+            faults = cell_alarm_inputs(cells)
             yield from (faults.short if name == "cell_short" else faults.reading).texts
         own = {"sensor_fault": SENSOR_SUSPECTS, "model_mismatch": MODEL_SUSPECTS}.get(name, InputFault(0)) & InputFault(
             int(self._estimator["checks"]["suspects"][0])

@@ -17,15 +17,15 @@ BRANCHES = len(TAU_S)
 """Number of RC pairs."""
 RESISTANCES = 1 + BRANCHES
 """Number of resistances: the series resistance, then that of each RC pair."""
-WEAK_J = 12e3
+LOW_ACTIVATION_ENERGY = 12e3
 """Activation energy of the weakly temperature-dependent part of each resistance, as in the electrolyte [J/mol]."""
-STRONG_J = 45e3
+HIGH_ACTIVATION_ENERGY = 45e3
 """Activation energy of the strongly temperature-dependent part of each resistance, as in reaction and diffusion
 [J/mol]."""
-HYSTERESIS_J = 8e3
+HYSTERESIS_ACTIVATION_ENERGY = 8e3
 """Activation energy of the hysteresis [J/mol]: the hysteresis between C/30 curves of an LFP cell, without the drop of
 its RC network, was 1.2 and 1.7 times as large at 5 and -15 C as at 25 C."""
-GAS_J = 8.314462618
+GAS_CONSTANT = 8.314462618
 """Molar gas constant [J/(mol K)]."""
 REFERENCE_C = 25.0
 """Temperature of the resistances and the OCV in a cell file [C]."""
@@ -33,7 +33,7 @@ GRID = 41
 """Number of nodes of resistances, entropy and hysteresis, evenly spaced over SOC 0..1."""
 
 WEAK_SHARE = (0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57)
-"""Default fraction of each resistance with activation energy ``WEAK_J``, for captures at a single temperature. The values
+"""Default fraction of each resistance with activation energy ``LOW_ACTIVATION_ENERGY``, for captures at a single temperature. The values
 are those of an 18650 NCA cell from -10 to 33 C, mean over SOC 0.3 to 1. An LFP cell from -15 to 25 C has 0.8, 1, 0.9,
 0.75, 0.7, 0.6, 0.6."""
 WEAK_FACTOR_SOC = (0.0, 0.1, 0.2, 0.3, 0.45)
@@ -57,7 +57,7 @@ def weak_share(soc: Floats) -> Floats:
 @njit(cache=True)
 def arrhenius(energy_j: float, temperature_c: float) -> float:
     """Return the factor on a resistance with activation energy ``energy_j`` [J/mol]; 1 at 25 C."""
-    return math.exp(energy_j / GAS_J * (1.0 / (temperature_c + 273.15) - 1.0 / (REFERENCE_C + 273.15)))
+    return math.exp(energy_j / GAS_CONSTANT * (1.0 / (temperature_c + 273.15) - 1.0 / (REFERENCE_C + 273.15)))
 
 
 @njit(cache=True)
@@ -74,10 +74,10 @@ def resistances(soc: float, weak_ohm: Floats, strong_ohm: Floats, weak: float, s
 
     Args:
         soc: State of charge.
-        weak_ohm: Shape (GRID, RESISTANCES), part with activation energy ``WEAK_J``, at 25 C [ohm].
-        strong_ohm: Shape (GRID, RESISTANCES), part with activation energy ``STRONG_J``, at 25 C [ohm].
-        weak: ``arrhenius(WEAK_J, T)``.
-        strong: ``arrhenius(STRONG_J, T)``.
+        weak_ohm: Shape (GRID, RESISTANCES), part with activation energy ``LOW_ACTIVATION_ENERGY``, at 25 C [ohm].
+        strong_ohm: Shape (GRID, RESISTANCES), part with activation energy ``HIGH_ACTIVATION_ENERGY``, at 25 C [ohm].
+        weak: ``arrhenius(LOW_ACTIVATION_ENERGY, T)``.
+        strong: ``arrhenius(HIGH_ACTIVATION_ENERGY, T)``.
         ohm: Shape (RESISTANCES,), written.
     """
     position = min(max(soc, 0.0), 1.0) * (GRID - 1)

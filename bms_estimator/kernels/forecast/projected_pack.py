@@ -44,14 +44,14 @@ GROWTH_SOC = 0.4
 """SOC below which the fast resistances R_0 and R_1 grow beyond those of the cell file."""
 GROWTH = 0.75
 """Relative growth of the fast resistances from ``GROWTH_SOC`` to SOC 0, beyond that of the cell file, at 25 C. Few captures for cell
-files contain large currents near empty. The growth increases with the Arrhenius factor of ``WEAK_J`` in the cold. Without growth, or
+files contain large currents near empty. The growth increases with the Arrhenius factor of ``LOW_ACTIVATION_ENERGY`` in the cold. Without growth, or
 with growth of all resistances, the forecasts of real captures are worse (docs/theory/forecast.md)."""
 FAST_RESISTANCES = 2
 """Number of fast resistances: R_0 and R_1. They decide the voltage at the peaks of a load, at which discharges end."""
 SURFACE_S = 15.0
 """Charge by which the surface of the particles is emptier than their mean, per ampere of the peak current [A s / A], at 25 C.
 Diffusion in the particles needs this gradient. The voltage is that of the surface, so that the knee near empty comes earlier under
-large currents. The gradient increases with the Arrhenius factor of ``WEAK_J`` in the cold."""
+large currents. The gradient increases with the Arrhenius factor of ``LOW_ACTIVATION_ENERGY`` in the cold."""
 
 PROJECTED_PACK = np.dtype(
     [

@@ -61,7 +61,7 @@ from bms_estimator.kernels.kalman_filter.records import (
     SOC,
     X,
 )
-from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
+from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.temperature import (
     is_temperature,
     update_arrhenius_factors,
@@ -70,7 +70,7 @@ from bms_estimator.kernels.kalman_filter.window import prepare_transition, reset
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-MAX_SINGLE_STD = 0.06
+MAX_STD_OF_ONE_HYPOTHESIS = 0.06
 """Maximum std of an initial SOC for which one filter suffices."""
 MAX_KEPT_STD = 1.0 / (HYPOTHESES - 2)
 """Maximum std of the SOC after a gap with the usual load for which one hypothesis continues the state before the gap. It equals
@@ -128,7 +128,7 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
     cov[LN_R0, LN_R] = cov[LN_R, LN_R0] = max(resistance_std(s, p) ** 2 - INDEPENDENT_R_STD**2, 0.0)
     s.learned_soc = s.gap_s = 0.0
     s.exchanged = 0
-    s.step.phase, s.step.ln_ratio, s.step.variance = UNHELD, 0.0, resistance_std(s, p) ** 2
+    s.step.phase, s.step.ln_ratio, s.step.variance = VARYING, 0.0, resistance_std(s, p) ** 2
     cov[OFFSET, OFFSET] = offset_variance(p)
     cov[LN_Q, LN_Q] = p.capacity_std**2
     reset_ocv_correction(p, x, cov)
@@ -146,7 +146,7 @@ def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
         copy_hypothesis(s, s.best, 0)
     forget_state_of_charge(s, p, 0)
     s.x_a[:] = 0.0
-    s.count = HYPOTHESES if soc_std > MAX_SINGLE_STD else 1
+    s.count = HYPOTHESES if soc_std > MAX_STD_OF_ONE_HYPOTHESIS else 1
     spacing = 2.0 * SPREAD_STDS * soc_std / (HYPOTHESES - 1)
     for q in range(s.count - 1, -1, -1):
         if q > 0:

@@ -22,7 +22,7 @@ from bms_estimator.kernels.kalman_filter.gap_charge import initialize_load_stati
 from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION, node_error_scale
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, HYPOTHESES, LN_Q, NODE, NODES, OFFSET, STATES
-from bms_estimator.kernels.kalman_filter.step_resistance import UNHELD
+from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.window import reset_window
 from bms_estimator.model.arrays import Record
 from bms_estimator.model.input_faults import InputFault
@@ -303,7 +303,7 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     soc_std = math.sqrt((f.soc_std + error_soc) ** 2 + (f.window.unknown_as / p.capacity_as) ** 2)
     f.soc_std = min(soc_std, MAX_SOC_STD)
     f.window.unknown_as = 0.0
-    f.step.phase = UNHELD
+    f.step.phase = VARYING
     bits = unusable_input_bits(c, p)
     if bits:
         c.suspects = bits

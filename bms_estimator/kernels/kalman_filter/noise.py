@@ -8,11 +8,11 @@ import math
 from bms_estimator.kernels.cell_model.chen_mora import ocv
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
+    HIGH_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
     REFERENCE_C,
     RESISTANCES,
-    STRONG_J,
     TAUS,
-    WEAK_J,
     arrhenius,
     resistances,
 )
@@ -145,7 +145,7 @@ def total_resistance(s: Record, p: Record, soc: float) -> float:
     """Return the sum of the resistances at ``soc`` [ohm]. The temperature is limited to ``max_known_temperature``."""
     weak, strong, limit_c = s.weak, s.strong, max_known_temperature(p)
     if s.temperature_c > limit_c:
-        weak, strong = arrhenius(WEAK_J, limit_c), arrhenius(STRONG_J, limit_c)
+        weak, strong = arrhenius(LOW_ACTIVATION_ENERGY, limit_c), arrhenius(HIGH_ACTIVATION_ENERGY, limit_c)
     resistances(soc, p.weak_ohm, p.strong_ohm, weak, strong, s.ohm)
     total = 0.0
     for k in range(RESISTANCES):

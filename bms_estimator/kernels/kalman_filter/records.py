@@ -53,7 +53,7 @@ class Noise:
     bias_grown: float = 0.11
     """Bias: std relative to the increase of the resistances over their values at 25 C and SOC 0.5, in the cold and near empty."""
     bias_soc: float = 0.035
-    """Bias: shift of the resistances and of the OCV's knee near empty along SOC at 25 C; it grows with ``WEAK_J``."""
+    """Bias: shift of the resistances and of the OCV's knee near empty along SOC at 25 C; it grows with ``LOW_ACTIVATION_ENERGY``."""
     slow_s: float = 3600.0
     """Bias: time constant of B_SLOW, which has half of the variance [s]."""
     fast_s: float = 45.0
@@ -125,8 +125,16 @@ EKF_SETTINGS = np.dtype(
         ("curve_soc", "f8", GRID),  # charge throughput over which the varying error of E_o changes [SOC]
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
         ("hysteresis_v", "f8", GRID),  # half of E_o after charge less E_o after discharge, at 25 C [V]
-        ("weak_ohm", "f8", (GRID, RESISTANCES)),  # resistances with activation energy WEAK_J, at 25 C [ohm]
-        ("strong_ohm", "f8", (GRID, RESISTANCES)),  # resistances with activation energy STRONG_J, at 25 C [ohm]
+        (
+            "weak_ohm",
+            "f8",
+            (GRID, RESISTANCES),
+        ),  # resistances with activation energy LOW_ACTIVATION_ENERGY, at 25 C [ohm]
+        (
+            "strong_ohm",
+            "f8",
+            (GRID, RESISTANCES),
+        ),  # resistances with activation energy HIGH_ACTIVATION_ENERGY, at 25 C [ohm]
         ("middle_ohm", "f8"),  # sum of all resistances at SOC 0.5 and 25 C [ohm]
         ("low_c", "f8"),  # temperature range of the resistances, lower end [C]
         ("high_c", "f8"),  # temperature range of the resistances, upper end [C]
@@ -163,7 +171,7 @@ WINDOW = np.dtype(
 
 STEP = np.dtype(
     [
-        ("phase", "i8"),  # UNHELD, HELD or STEPPED of step_resistance
+        ("phase", "i8"),  # VARYING, CONSTANT or STEPPED of step_resistance
         ("current_a", "f8"),  # last constant current [A]
         ("voltage_v", "f8"),  # voltage at that current [V]
         ("x_a", "f8", BRANCHES),  # filtered currents of the RC pairs at that time [A]
@@ -208,9 +216,9 @@ EKF_STATE = np.dtype(
         ("usual_a", "f8"),  # mean current over hours [A]
         ("usual_a2", "f8"),  # mean squared current over hours [A^2]
         ("temperature_c", "f8"),  # temperature of the cell, measured or modelled [C]
-        ("weak", "f8"),  # Arrhenius factor of WEAK_J at that temperature
-        ("strong", "f8"),  # Arrhenius factor of STRONG_J
-        ("hysteresis", "f8"),  # Arrhenius factor of HYSTERESIS_J
+        ("weak", "f8"),  # Arrhenius factor of LOW_ACTIVATION_ENERGY at that temperature
+        ("strong", "f8"),  # Arrhenius factor of HIGH_ACTIVATION_ENERGY
+        ("hysteresis", "f8"),  # Arrhenius factor of HYSTERESIS_ACTIVATION_ENERGY
         ("sensed", "i8"),  # 1: a temperature was reported
         ("soc", "f8"),  # mean SOC of the mixture
         ("soc_std", "f8"),  # std of the SOC of the mixture

@@ -16,8 +16,8 @@ from bms_estimator.kernels.kalman_filter.records import LN_R, SOC
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-UNHELD, HELD, STEPPED = range(3)
-"""Phases of ``detect_current_step``. UNHELD: the current varies. HELD: it is constant. STEPPED: it changed after HELD."""
+VARYING, CONSTANT, STEPPED = range(3)
+"""Phases of ``detect_current_step``. VARYING: the current varies. CONSTANT: it is constant. STEPPED: it changed after CONSTANT."""
 MIN_STEP_C = 0.2
 """Minimum change of the current between two samples of a current step, as a C-rate."""
 MAX_HELD_CHANGE = 0.1
@@ -42,17 +42,17 @@ def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, volt
         voltage_v: Voltage of the sample [V].
     """
     step, min_step_a = s.step, MIN_STEP_C * p.capacity_as / 3600.0
-    previous_phase, step.phase = step.phase, UNHELD
+    previous_phase, step.phase = step.phase, VARYING
     step.variance += SHAPE_STD**2 * abs(s.current_a) * dt_s / p.capacity_as
     if dt_s > MAX_STEP_S:
         return
     stepped_a = abs(s.current_a - step.current_a)
     if previous_phase == STEPPED and stepped_a >= min_step_a and abs(change_a) <= MAX_HELD_CHANGE * stepped_a:
         update_r_s_from_step(s, p, voltage_v)
-    elif previous_phase == HELD and abs(change_a) >= min_step_a:
+    elif previous_phase == CONSTANT and abs(change_a) >= min_step_a:
         step.phase = STEPPED
     if abs(change_a) <= MAX_HELD_CHANGE * min_step_a:
-        step.phase = HELD
+        step.phase = CONSTANT
         step.current_a, step.voltage_v = s.current_a, voltage_v
         for k in range(BRANCHES):
             step.x_a[k] = s.x_a[k]

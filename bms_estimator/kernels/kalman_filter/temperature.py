@@ -7,10 +7,10 @@ import math
 
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
-    HYSTERESIS_J,
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
     REFERENCE_C,
-    STRONG_J,
-    WEAK_J,
     arrhenius,
     resistances,
 )
@@ -67,5 +67,8 @@ def is_temperature(temperature_c: float) -> bool:
 @njit(cache=True)
 def update_arrhenius_factors(s: Record) -> None:
     """Compute the Arrhenius factors at the cell's temperature."""
-    s.weak, s.strong = arrhenius(WEAK_J, s.temperature_c), arrhenius(STRONG_J, s.temperature_c)
-    s.hysteresis = arrhenius(HYSTERESIS_J, s.temperature_c)
+    s.weak, s.strong = (
+        arrhenius(LOW_ACTIVATION_ENERGY, s.temperature_c),
+        arrhenius(HIGH_ACTIVATION_ENERGY, s.temperature_c),
+    )
+    s.hysteresis = arrhenius(HYSTERESIS_ACTIVATION_ENERGY, s.temperature_c)

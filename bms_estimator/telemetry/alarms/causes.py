@@ -10,7 +10,7 @@ from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.message import AlarmMessage, RaisedAlarm
 from bms_estimator.telemetry.alarms.sensor_faults import FaultTexts, FaultyInput
-from bms_estimator.telemetry.cells import NO_CELL_FAULT, CellFault
+from bms_estimator.telemetry.cells import NO_FAULTY_CELL, CellAlarmInput
 from bms_estimator.telemetry.state import UNKNOWN_SOC, missing_margin_reason
 
 LOSS_TEXTS: dict[FaultyInput, str] = {
@@ -39,7 +39,7 @@ class Causes:
         self._lost: tuple[Quantity, ...] = ()
         self._texts: dict[AlarmName, tuple[str, ...]] = {}
         self._suspects: dict[AlarmName, InputFault] = {}  # faults that the text of an alarm describes
-        self._cell_faults: dict[AlarmName, CellFault] = {}
+        self._faulty_cells: dict[AlarmName, CellAlarmInput] = {}
 
     @property
     def has_suspects(self) -> bool:
@@ -67,14 +67,14 @@ class Causes:
             self._suspects[name] = suspects
             self._texts[name] = suspect_texts(suspects, suspicions())
 
-    def set_cell_fault(self, name: AlarmName, fault: CellFault, *, is_raised: bool) -> None:
+    def set_cell_fault(self, name: AlarmName, fault: CellAlarmInput, *, is_raised: bool) -> None:
         """Replace the causes of an alarm by faults of single cells.
 
         The text of a raised alarm changes only with the kinds of its faults, because its numbers change often.
         """
-        described = self._cell_faults.get(name, NO_CELL_FAULT)
+        described = self._faulty_cells.get(name, NO_FAULTY_CELL)
         if not is_raised or (fault.kinds and fault.kinds != described.kinds):
-            self._texts[name], self._cell_faults[name] = fault.texts, fault
+            self._texts[name], self._faulty_cells[name] = fault.texts, fault
 
     def set_unwatched(self, names: Iterable[AlarmName], lost: tuple[Quantity, ...], silence_reason: str) -> None:
         """Replace the alarms that cannot be watched.

@@ -26,7 +26,7 @@ from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIE
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.alarms.saved_state import decode, encode
 from bms_estimator.telemetry.alarms.sensor_faults import WRONG_CLOCK_TEXT, ProbeFaults
-from bms_estimator.telemetry.cells import CellFaults
+from bms_estimator.telemetry.cells import CellAlarmInputs
 from bms_estimator.telemetry.health import suspicions
 
 MIN_WATCHED_S = 10.0
@@ -78,7 +78,7 @@ class AlarmEvaluator:
         cells_fault: str = "",
         clock_fault: str = "",
         lost: int = 0,
-        cell_faults: CellFaults | None = None,
+        cell_alarm_inputs: CellAlarmInputs | None = None,
         weak_cell_std: float = math.nan,
     ) -> None:
         """Evaluate all alarms on a block, after the estimator has processed it.
@@ -93,7 +93,7 @@ class AlarmEvaluator:
             cells_fault: Reason why the cell voltages cannot be used; empty if they can.
             clock_fault: Fault of the source's clock as a sentence; empty without one.
             lost: Number of samples since start that were lost on the line.
-            cell_faults: New faults of single cells; None without a new estimate.
+            cell_alarm_inputs: New faults of single cells; None without a new estimate.
             weak_cell_std: Deviation of the last discharge from the bank's reference [std]; NaN if unknown.
         """
         if not samples.size:
@@ -111,9 +111,9 @@ class AlarmEvaluator:
         )
         part["wall_offset_s"], part["lost"], part["weak_cell_std"] = arrival_s - last_s, lost, weak_cell_std
         part["cells_at_s"] = math.nan
-        if cell_faults:
-            short, reading = cell_faults.short, cell_faults.reading
-            part["cells_at_s"], part["short_a"], part["reading_v"] = cell_faults.at_s, short.value, reading.value
+        if cell_alarm_inputs:
+            short, reading = cell_alarm_inputs.short, cell_alarm_inputs.reading
+            part["cells_at_s"], part["short_a"], part["reading_v"] = cell_alarm_inputs.at_s, short.value, reading.value
             causes.set_cell_fault("cell_short", short, is_raised=alarms.is_raised("cell_short"))
             causes.set_cell_fault("cell_sensor_fault", reading, is_raised=alarms.is_raised("cell_sensor_fault"))
         risk = np.ascontiguousarray(forecasts["cutoff_within_5min"])

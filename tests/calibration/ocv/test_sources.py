@@ -18,7 +18,7 @@ from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
 from bms_estimator.calibration.ocv_cell import determine_ocv
-from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, arrhenius
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import load_capture
@@ -249,7 +249,7 @@ def test_the_hysteresis_of_a_cold_pair_is_converted_to_25_c(shared_data):
         result = find_sources(
             [Recording(name, load_capture(folder / name).rows) for name in names], [], capacity_ah=2.06
         )
-        temperature_factor = arrhenius(HYSTERESIS_J, result.sources[0].temperature_c)
+        temperature_factor = arrhenius(HYSTERESIS_ACTIVATION_ENERGY, result.sources[0].temperature_c)
         half_v = np.interp(NODES, GRID, result.sources[0].hysteresis_v)
         assert result.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v / temperature_factor)
         mean_v[at] = result.hysteresis_v[INSIDE].mean()

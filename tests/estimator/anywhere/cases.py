@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from bms_estimator.calibration.ocv.hysteresis import REST_SHARE_STD
-from bms_estimator.kernels.cell_model.rc_ladder import STRONG_J, TAU_S, WEAK_J, arrhenius
+from bms_estimator.kernels.cell_model.rc_ladder import HIGH_ACTIVATION_ENERGY, LOW_ACTIVATION_ENERGY, TAU_S, arrhenius
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
@@ -298,7 +298,9 @@ def ladder(truth: Truth, temperatures_c: tuple[float, ...], rng: np.random.Gener
         rows, normalized_impedances = [], []
         for t in temperatures_c:
             true_impedance = impedance(truth, node, t, RAD_S, STEADY_C * truth.capacity_ah)
-            parts = [arrhenius(energy_j, t) * unit_impedances for energy_j in (WEAK_J, STRONG_J)]
+            parts = [
+                arrhenius(energy_j, t) * unit_impedances for energy_j in (LOW_ACTIVATION_ENERGY, HIGH_ACTIVATION_ENERGY)
+            ]
             rows.append(
                 (unit_impedances if len(temperatures_c) == 1 else np.hstack(parts)) / np.abs(true_impedance)[:, None]
             )

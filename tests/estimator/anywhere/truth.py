@@ -28,7 +28,7 @@ KINETIC_V = 0.051
 """Overpotential 2 R T / F above which the resistance of charge transfer falls [V]."""
 COOLING_S = 900.0
 """Thermal time constant of a cell [s]."""
-GAS_J, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
+GAS_CONSTANT, KELVIN, REFERENCE_K = 8.314462618, 273.15, 298.15
 """Gas constant [J/mol/K], 0 C and 25 C [K]."""
 TAPER_C = 0.05
 """Current at which a charger ends its charge [C]."""
@@ -134,7 +134,7 @@ def simulate_from(
             i = 0.0
         elif i != 0.0:
             stopped = 0.0
-        inverse_temperature = (1.0 / (celsius + KELVIN) - 1.0 / REFERENCE_K) / GAS_J
+        inverse_temperature = (1.0 / (celsius + KELVIN) - 1.0 / REFERENCE_K) / GAS_CONSTANT
         x[0] = i
         open_v = interpolate(soc, ocv_v) + (celsius - 25.0) * interpolate(soc, per_kelvin_v)
         v = open_v + interpolate(soc, hysteresis_v) * (FAST_FRACTION * fast + (1.0 - FAST_FRACTION) * slow)
@@ -168,7 +168,7 @@ def impedance(truth: Truth, node: int, temperature_c: float, rad_s: Floats, curr
 
     The resistance of charge transfer depends on the current and is taken at ``current_a``.
     """
-    arrhenius_factor = np.exp(ENERGY_J / GAS_J * (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K))
+    arrhenius_factor = np.exp(ENERGY_J / GAS_CONSTANT * (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K))
     ohm = truth.ohm[node] * arrhenius_factor
     drop = ohm[KINETIC] * current_a / KINETIC_V
     ohm[KINETIC] *= math.asinh(drop) / drop

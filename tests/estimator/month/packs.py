@@ -14,7 +14,7 @@ from tests.estimator.anywhere.cases import OCV_STD_V, OXIDE, PHOSPHATE, own_file
 from tests.estimator.anywhere.cycles import Cycle, total_ohm, true_curve
 from tests.estimator.anywhere.truth import (
     ENERGY_J,
-    GAS_J,
+    GAS_CONSTANT,
     GRID,
     KELVIN,
     REFERENCE_K,
@@ -59,7 +59,7 @@ class Pack:
     def charger_v(self, temperature_c: float = 25.0) -> float:
         """Return the voltage limit at which the current has fallen to C/20 when the SOC reaches 1 [V]."""
         truth = self.truth
-        inverse_k = (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K) / GAS_J
+        inverse_k = (1.0 / (temperature_c + KELVIN) - 1.0 / REFERENCE_K) / GAS_CONSTANT
         ohm = float(truth.ohm[-1] @ np.exp(ENERGY_J * inverse_k))
         ocv_v = truth.ocv_v[-1] + truth.hysteresis_v[-1] + (temperature_c - 25.0) * truth.per_kelvin_v[-1]
         return float(ocv_v + TAPER_C * truth.capacity_ah * ohm)

@@ -7,7 +7,6 @@ from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK, PackRegistry
 from bms_estimator.fleet.packs.pack_row import (
     COLUMNS,
     FIT_INTERVAL_S,
-    PackRow,
     PackSpec,
     decode_row,
     encode_row,
@@ -130,14 +129,9 @@ def test_generic_cell_without_capacity_is_reported_once(write_table):
 
 
 def test_row_of_the_table_gives_the_settings_of_a_pack():
-    row = PackRow(pack="house", cell="lfp", capacity_ah=280.0, series=16, protocol="jk", current_dead_band_a=0.2)
+    row = PackSpec(cell="lfp", capacity_ah=280.0, series=16, protocol="jk", current_dead_band_a=0.2)
     settings = settings_of(row)
-    assert (settings.pack.name, settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == (
-        "house",
-        "lfp",
-        280.0,
-        16,
-    )
+    assert (settings.pack.cell, settings.pack.capacity_ah, settings.pack.series) == ("lfp", 280.0, 16)
     assert (settings.sensor.voltage_resolution_v, settings.sampling.period_s) == (0.01, 1.0)
     assert settings.sampling.current_dead_band_a == 0.2
 

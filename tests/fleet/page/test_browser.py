@@ -248,6 +248,7 @@ async def test_results_of_the_queries_are_shown_and_lead_to_packs(browser: Brows
         answers = browser_tab.page.locator("#answers")
         text = await answers.locator("[data-answer=soh] tbody").inner_text()
         assert text.startswith("ncr18650 1s1p 3 Ah\t12\t")
+        assert (await browser_tab.page.locator(".card:visible").first.inner_text()).startswith("About to fail")
         outlier = answers.locator("[data-answer=outliers] tbody tr")
         assert (await outlier.inner_text()).startswith("p0\tcapacity ratio\t")
         await outlier.get_by_role("button", name="p0").click()

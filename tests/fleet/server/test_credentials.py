@@ -21,7 +21,7 @@ from nats.errors import Error as NatsError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.dead_packs import DeadPackReader
 from bms_estimator.fleet.nats.streams import consumer, make_streams
@@ -50,7 +50,7 @@ class Fleet:
 
     def token(self, pack: str, tenant: str = "acme", issued: datetime = NOW, expires: datetime | None = None) -> str:
         """Return the token of an edge."""
-        return credentials.edge_token(self.keys, tenant, pack, issued, expires)
+        return credentials.edge_tokens(self.keys, tenant, [pack], issued, expires)[pack]
 
     def edge(self, token: str, **options: object) -> aiomqtt.Client:
         """Return an MQTT client that authenticates with a token."""
@@ -304,7 +304,7 @@ async def _run_worker(fleet: Fleet) -> None:
         await working
         checkpoints = await reader.jetstream().key_value(subjects.CHECKPOINTS_BUCKET)
         pointers = [await checkpoints.get(key) for key in await checkpoints.keys() if key != "any"]  # of another test
-        assert any(Pointer.model_validate_json(pointer.value or b"").kept for pointer in pointers)
+        assert any(CheckpointPointer.model_validate_json(pointer.value or b"").kept for pointer in pointers)
 
 
 async def test_reader_reads_everything_and_cannot_write(fleet: Fleet) -> None:
@@ -346,7 +346,7 @@ async def test_invalid_tokens_are_rejected(fleet: Fleet, tmp_path: Path) -> None
     tokens = {
         "none": "",
         "expired": fleet.token("p1", issued=NOW - 2 * day, expires=NOW - day),
-        "signed by another operator": credentials.edge_token(tmp_path, "acme", "p1", NOW),
+        "signed by another operator": credentials.edge_tokens(tmp_path, "acme", ["p1"], NOW)["p1"],
         "claims of another pack": f"{head}.{fleet.token('p2').split('.')[1]}.{signature}",
         "a worker's": worker_token,
     }
@@ -395,7 +395,7 @@ def test_keys_are_created_once_and_claims_do_not_change(tmp_path: Path) -> None:
 
 def test_errors_do_not_show_keys(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"no keys of a tenant acme: start `fleet serve`"):
-        credentials.edge_token(tmp_path, "acme", "p1", NOW)
+        credentials.edge_tokens(tmp_path, "acme", ["p1"], NOW)["p1"]
     with pytest.raises(UserError, match=r"claims\.json: cannot be read"):
         credentials.read_accounts(tmp_path)
     (tmp_path / "claims.json").write_text("{}")
@@ -403,10 +403,10 @@ def test_errors_do_not_show_keys(tmp_path: Path) -> None:
         credentials.read_accounts(tmp_path)
     credentials.make_accounts(tmp_path, TENANTS, NOW)
     with pytest.raises(UserError, match="there are acme, other"):
-        credentials.edge_token(tmp_path, "nobody", "p1", NOW)
+        credentials.edge_tokens(tmp_path, "nobody", ["p1"], NOW)["p1"]
     (tmp_path / "acme" / "edge.nk").write_text("SAADEFECT")
     with pytest.raises(UserError, match=r"edge\.nk: not a key") as raised:
-        credentials.edge_token(tmp_path, "acme", "p1", NOW)
+        credentials.edge_tokens(tmp_path, "acme", ["p1"], NOW)["p1"]
     assert "DEFECT" not in str(raised.value)
 
 

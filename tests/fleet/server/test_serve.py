@@ -32,6 +32,7 @@ from bms_estimator.process.child_process import find_server
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings, TlsSettings
 from tests.command_line import run
 from tests.fleet.serve_process import ServeProcess
+from tests.fleet.workers import Heartbeats, Process, block, load_packs, send
 from tests.free_port import free_port
 from tests.full_disk import small_disk
 from tests.mqtt.certificates import Authority
@@ -92,7 +93,7 @@ def port_of(listen: str) -> int:
 
 async def send_block(folder: Path, context: ssl.SSLContext, tenant: str = "acme") -> None:
     """Send a block with the token of an edge."""
-    token = credentials.edge_token(folder / "state" / "keys", tenant, "p1", datetime.now(UTC))
+    token = credentials.edge_tokens(folder / "state" / "keys", tenant, ["p1"], datetime.now(UTC))["p1"]
     port = port_of(settings_of(folder).server.mqtt)
     async with (
         asyncio.timeout(LONG_S),
@@ -232,27 +233,36 @@ async def test_server_logs_a_warning_when_unsaved_blocks_fill_half_of_the_stream
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_server_stores_again_after_its_disk_was_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_worker_names_the_full_disk_of_the_server_which_stores_again_when_space_is_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(nats_server, "HEALTH_S", 0.2)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
     settings = ServerSettings(**ports, partitions=1, packs=1, outage_days=0.01, disk_gb=0.29)
-    lines: list[str] = []
-    with small_disk(tmp_path / "disk", "300m") as disk, capture_logs() as logs:
+    lines, url = list[str](), f"nats://{ports['listen']}"
+    with small_disk(tmp_path / "disk", "300m") as disk, capture_logs() as logs, contextlib.ExitStack() as stack:
         spec = ServerSpec(FleetSettings(server=settings))
         task = asyncio.create_task(serve_node(NodeLocation(disk / "state"), lambda: spec, lines.append))
         await until(lambda: any("streams ready" in line for line in lines) or task.done())
-        filler = disk / "filler"
-        with contextlib.suppress(OSError), filler.open("wb") as file:
-            while True:
-                file.write(bytes(1 << 20))
-        async with await nats.connect(f"nats://{ports['listen']}") as nc:
+        stack.callback(Process(tmp_path, url, "w", "--checkpoint-s", 1).kill)
+        async with await nats.connect(url) as nc, Heartbeats(nc) as heartbeats:
+            await load_packs(nc, ["p1"])
+            await send(nc, "p1", block("p1", 1))
+            await heartbeats.until(lambda last: "w" in last and last["w"].blocks == 1 and not last["w"].unsaved_s)
+            filler = disk / "filler"
+            with contextlib.suppress(OSError), filler.open("wb") as file:
+                while True:
+                    file.write(bytes(1 << 20))
+            await nc.publish(subjects.raw("p1"), block("p1", 2))
             await nc.publish(subjects.raw("a"), bytes(200_000))
-            await nc.flush()
-        await until(lambda: any(line["event"].startswith("the disk is full") for line in logs))
-        filler.unlink()
-        await until(lambda: sum("streams ready" in line for line in lines) == 2)
-        async with await nats.connect(f"nats://{ports['listen']}") as nc:
-            await nc.jetstream(timeout=LONG_S).publish(subjects.raw("a"), b"stored again")
+            await until(lambda: any(line["event"].startswith("the disk is full") for line in logs))
+            await heartbeats.until(lambda last: "no space left on device" in last["w"].trouble)
+            filler.unlink()
+            await until(lambda: sum("streams ready" in line for line in lines) == 2)
+            await send(nc, "p1", block("p1", 3))
+            await heartbeats.until(
+                lambda last: last["w"].blocks > 1 and not last["w"].trouble and not last["w"].unsaved_s
+            )
         assert not task.done()
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)

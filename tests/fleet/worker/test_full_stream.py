@@ -13,7 +13,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.nats import unsaved_blocks as unsaved_module
-from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, CheckpointPointer, pointer_key
 from bms_estimator.fleet.nats.streams import RAW_BYTES, make_streams
 from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
 from bms_estimator.fleet.packs.csv_table import read_table
@@ -130,7 +130,7 @@ async def test_status_warns_when_unsaved_blocks_fill_half_of_the_stream(
             assert code == 0
             warnings.append(" of the stream RAW are blocks that no checkpoint includes" in out)
         assert warnings == [False, True]
-        pointer = Pointer(kept=(CheckpointInfo(sequence=3, object="p0.1", bytes=1, made_s=1.79e9),))
+        pointer = CheckpointPointer(kept=(CheckpointInfo(sequence=3, object="p0.1", bytes=1, made_s=1.79e9),))
         bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
         await bucket.put(pointer_key(0), pointer.model_dump_json().encode())
         share = (await unsaved_blocks(nc, range(PARTITIONS))).share
@@ -151,7 +151,9 @@ async def test_blocks_that_the_limit_of_one_pack_drops_are_named(
         await js.publish(subjects.raw("seldom"), b"0")
         bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
         for sequence, has_dropped in ((3, True), (15, False)):
-            pointer = Pointer(kept=(CheckpointInfo(sequence=sequence, object="p0.1", bytes=1, made_s=1.79e9),))
+            pointer = CheckpointPointer(
+                kept=(CheckpointInfo(sequence=sequence, object="p0.1", bytes=1, made_s=1.79e9),)
+            )
             await bucket.put(pointer_key(0), pointer.model_dump_json().encode())
             warning = (await unsaved_blocks(nc, range(PARTITIONS))).warning
             assert ("stores 10 blocks of a pack, has dropped blocks of often" in warning) == has_dropped

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from nats.aio.client import Client
 
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.checkpoint.admin_changes import read_pointers
 from tests.fleet.nats_cluster import connected, running
@@ -61,5 +61,5 @@ async def test_worker_fills_the_buckets_of_a_new_disk_with_its_states_and_the_ta
 async def _until_saved(nc: Client) -> None:
     """Wait until the pointer of the partition names a checkpoint."""
     async with asyncio.timeout(LONG_S):
-        while not (await read_pointers(nc)).get(0, Pointer()).kept:  # noqa: ASYNC110 - the server is asked
+        while not (await read_pointers(nc)).get(0, CheckpointPointer()).kept:  # noqa: ASYNC110 - the server is asked
             await asyncio.sleep(0.1)

@@ -17,7 +17,7 @@ from bms_estimator.model.sample import NO_CELLS, SampleStatus
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.cells import cell_faults
+from bms_estimator.telemetry.cells import cell_alarm_inputs
 from tests.fleet.worker.test_single_cells import CELLS, MODEL, SETTINGS, minutes, table
 
 PACK = "a"
@@ -129,9 +129,9 @@ class LiveRun:
         block = decode(encode(block))
         trace = self.pack.run(block.samples, block.cells_v).trace
         cells = self.pack.cells.deviations
-        faults = cell_faults(cells) if cells is not None and cells is not self.seen else None
+        faults = cell_alarm_inputs(cells) if cells is not None and cells is not self.seen else None
         self.seen = cells
-        self.alarms.evaluate(block.samples, trace, block.cells_v, block.arrival_s, cell_faults=faults)
+        self.alarms.evaluate(block.samples, trace, block.cells_v, block.arrival_s, cell_alarm_inputs=faults)
         return dict(zip(NAMES, self.alarms._alarms.states, strict=True))
 
 

@@ -12,7 +12,7 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import RefusedPartition
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
@@ -74,13 +74,13 @@ async def send_blocks(nc: Client, number: int) -> None:
         await send(nc, pack, block(pack, number))
 
 
-async def pointers(nc: Client) -> list[Pointer]:
+async def pointers(nc: Client) -> list[CheckpointPointer]:
     """Return the pointers to the checkpoints of all claimed partitions."""
     entries = await read_bucket(nc, subjects.CHECKPOINTS_BUCKET)
-    return [Pointer.model_validate_json(entries[key]) for key in sorted(entries)]
+    return [CheckpointPointer.model_validate_json(entries[key]) for key in sorted(entries)]
 
 
-async def until_saved(nc: Client, *, blocks: int, file_format: int) -> list[Pointer]:
+async def until_saved(nc: Client, *, blocks: int, file_format: int) -> list[CheckpointPointer]:
     """Wait until the last checkpoints include all blocks and have a format, and return the pointers to them.
 
     Args:

@@ -18,7 +18,7 @@ import nats.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer, pointer_key
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, CheckpointPointer, pointer_key
 from bms_estimator.fleet.nats.connection import RETRY_S
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
@@ -77,7 +77,7 @@ def day_of(info: CheckpointInfo) -> date:
     return datetime.fromtimestamp(info.made_s, UTC).date()
 
 
-async def read_pointers(nc: Client) -> dict[int, Pointer]:
+async def read_pointers(nc: Client) -> dict[int, CheckpointPointer]:
     """Return the pointers to the checkpoints, by partition.
 
     Raises:
@@ -86,7 +86,9 @@ async def read_pointers(nc: Client) -> dict[int, Pointer]:
     partitions = await require_partitions(nc)
     entries = await read_bucket(nc, subjects.CHECKPOINTS_BUCKET)
     keys = {number: pointer_key(number) for number in range(partitions)}
-    return {number: Pointer.model_validate_json(entries[key]) for number, key in keys.items() if key in entries}
+    return {
+        number: CheckpointPointer.model_validate_json(entries[key]) for number, key in keys.items() if key in entries
+    }
 
 
 async def restore_day(

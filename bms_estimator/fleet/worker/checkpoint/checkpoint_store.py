@@ -19,7 +19,7 @@ from nats.js.kv import KeyValue
 from nats.js.object_store import ObjectStore
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Pointer
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, CheckpointPointer
 from bms_estimator.fleet.nats.stream_sizes import DAILY_CHECKPOINTS
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import INCREMENT_FORMAT, PartitionCheckpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import CheckpointObjects
@@ -34,7 +34,7 @@ DAY_S = 86_400
 
 
 def next_increment(
-    checkpoint: PartitionCheckpoint, pointer: Pointer, *, file_format: int, now_s: float
+    checkpoint: PartitionCheckpoint, pointer: CheckpointPointer, *, file_format: int, now_s: float
 ) -> PartitionCheckpoint | None:
     """Return the increment to write after the last checkpoint; None if a whole checkpoint must be written.
 
@@ -54,7 +54,7 @@ def next_increment(
     return increment if size <= MAX_INCREMENT_FRACTION * last.bytes else None
 
 
-def with_increment(pointer: Pointer, sequence: int, size: int, now_s: float) -> Pointer:
+def with_increment(pointer: CheckpointPointer, sequence: int, size: int, now_s: float) -> CheckpointPointer:
     """Return a pointer with the next object as an increment of the last checkpoint.
 
     Args:
@@ -70,7 +70,7 @@ def with_increment(pointer: Pointer, sequence: int, size: int, now_s: float) -> 
         "increments": (*last.increments, pointer.next),
         "increment_bytes": last.increment_bytes + size,
     }
-    return Pointer(kept=(last.model_copy(update=update), *earlier), daily=pointer.daily)
+    return CheckpointPointer(kept=(last.model_copy(update=update), *earlier), daily=pointer.daily)
 
 
 def has_daily(daily: tuple[CheckpointInfo, ...], now_s: float) -> bool:
@@ -118,7 +118,7 @@ class CheckpointStore:
         """
         stored = await self.claims.read(partition)
         if stored is None:
-            return await self.claims.write(partition, 0, Pointer())  # revision 0: the key must not exist
+            return await self.claims.write(partition, 0, CheckpointPointer())  # revision 0: the key must not exist
         # listed before the claim: later objects may be those of a worker that claims the partition next
         objects = await self._objects.names(partition)
         counted = stored.pointer.model_copy(update={"unsaved_claims": stored.pointer.unsaved_claims + 1})
@@ -206,7 +206,9 @@ class CheckpointStore:
             size = await self._objects.write(pointer.next, chunks)
             whole = {"object": pointer.next, "bytes": size, "increments": (), "increment_bytes": 0}
             new = (old.model_copy(update=whole),)
-        new_pointer = Pointer(kept=_replaced(pointer.kept, old, new), daily=_replaced(pointer.daily, old, new))
+        new_pointer = CheckpointPointer(
+            kept=_replaced(pointer.kept, old, new), daily=_replaced(pointer.daily, old, new)
+        )
         return await self._replace_pointer(claim, new_pointer, erase=True)
 
     async def replace_last(self, claim: Claim, checkpoint: PartitionCheckpoint, *, file_format: int) -> Claim:
@@ -222,13 +224,13 @@ class CheckpointStore:
         """
         size = await self._objects.write(claim.pointer.next, checkpoint.chunks(file_format))
         info = _whole_info(claim, checkpoint, size, file_format)
-        return await self._replace_pointer(claim, Pointer(kept=(info,), daily=claim.pointer.daily))
+        return await self._replace_pointer(claim, CheckpointPointer(kept=(info,), daily=claim.pointer.daily))
 
-    def _with_whole(self, pointer: Pointer, info: CheckpointInfo) -> Pointer:
+    def _with_whole(self, pointer: CheckpointPointer, info: CheckpointInfo) -> CheckpointPointer:
         """Return a pointer with a whole checkpoint added. The oldest is left out, and each one that is known to be damaged."""
         intact = (each for each in pointer.kept if each.object not in self._damaged)
         daily = pointer.daily if has_daily(pointer.daily, info.made_s) else (info, *pointer.daily)[:DAILY_CHECKPOINTS]
-        return Pointer(kept=(info, *intact)[:CHECKPOINTS_PER_PARTITION], daily=daily)
+        return CheckpointPointer(kept=(info, *intact)[:CHECKPOINTS_PER_PARTITION], daily=daily)
 
     async def _remove_oldest_daily(self, claim: Claim) -> None:
         """Remove the older half of the daily checkpoints of a partition, and the unfinished next object."""
@@ -242,7 +244,7 @@ class CheckpointStore:
             removed=len(pointer.daily) - len(remaining.daily),
         )
 
-    async def _replace_pointer(self, claim: Claim, new: Pointer, *, erase: bool = False) -> Claim:
+    async def _replace_pointer(self, claim: Claim, new: CheckpointPointer, *, erase: bool = False) -> Claim:
         """Replace a pointer, and remove the objects that the new one does not name any more.
 
         Args:

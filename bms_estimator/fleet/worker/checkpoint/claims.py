@@ -19,7 +19,7 @@ from nats.nuid import NUID
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.edge import subjects
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer, pointer_key
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer, pointer_key
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError, is_readable
 from bms_estimator.fleet.worker.checkpoint.checkpoint_objects import object_name
 
@@ -87,7 +87,7 @@ class StoredPointer(NamedTuple):
     """Pointer as read from the bucket."""
 
     revision: int
-    pointer: Pointer
+    pointer: CheckpointPointer
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Claim:
 
     partition: int
     revision: int
-    pointer: Pointer
+    pointer: CheckpointPointer
 
 
 class Claims:
@@ -110,7 +110,7 @@ class Claims:
     def __init__(self, worker: str, bucket: KeyValue) -> None:
         self._worker, self._bucket = worker, bucket
         self._object_names = NUID()
-        self._last_sent: dict[int, Pointer] = {}  # by partition; its response may have been lost
+        self._last_sent: dict[int, CheckpointPointer] = {}  # by partition; its response may have been lost
 
     async def check_format(self, partition: int) -> None:
         """Check that the last checkpoint of a partition can be read.
@@ -143,7 +143,7 @@ class Claims:
         stored = await self._read(claim.partition)
         if stored is None and await self._has_lost(claim):
             log.error("the server has lost its checkpoints: the state is saved again", partition=claim.partition)
-            return Claim(claim.partition, 0, Pointer(worker=self._worker, next=claim.pointer.next))
+            return Claim(claim.partition, 0, CheckpointPointer(worker=self._worker, next=claim.pointer.next))
         if stored is None or stored.revision <= claim.revision:  # a lower revision comes from a lagging node
             return claim
         if stored.pointer == self._last_sent.get(claim.partition):
@@ -165,7 +165,7 @@ class Claims:
             pointer = claim.pointer.model_copy(update={"unsaved_claims": 0})
             await self.write(claim.partition, claim.revision, pointer)
 
-    async def write(self, partition: int, revision: int, pointer: Pointer) -> Claim:
+    async def write(self, partition: int, revision: int, pointer: CheckpointPointer) -> Claim:
         """Write a pointer with the name of this worker and of its next object.
 
         Args:
@@ -199,6 +199,6 @@ class Claims:
         except KeyNotFoundError:
             return None
         try:
-            return StoredPointer(entry.revision or 0, Pointer.model_validate_json(entry.value or b""))
+            return StoredPointer(entry.revision or 0, CheckpointPointer.model_validate_json(entry.value or b""))
         except ValidationError as error:
             raise UnreadableFormatError(0) from error

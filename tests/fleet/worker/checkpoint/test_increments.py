@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nats.aio.client import Client
 
-from bms_estimator.fleet.nats.checkpoint_pointer import Pointer
+from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import (
     CHECKPOINTS_PER_PARTITION,
@@ -57,7 +57,7 @@ class Saves:
         self.claim: Claim | None = None
 
     @property
-    def pointer(self) -> Pointer:
+    def pointer(self) -> CheckpointPointer:
         assert self.claim
         return self.claim.pointer
 
