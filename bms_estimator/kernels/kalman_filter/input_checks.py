@@ -12,6 +12,7 @@ from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_
 from bms_estimator.kernels.kalman_filter.frozen_sensor import (
     FAST_S,
     FROZEN_S,
+    MEAN_SAMPLES,
     OUTLIERS_S,
     UNOBSERVED_CHARGE_ERROR,
     VISIBLE_V,
@@ -256,7 +257,7 @@ def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, volt
     change_a = current_a - 2.0 * c.slow_a + c.slower_a
     limit_v = MAX_CHANGE_RATIO * ohm * abs(change_a)
     change_v = min(max(voltage_v - 2.0 * c.slow_v + c.slower_v, -limit_v), limit_v)
-    share = min(1.0, dt_s / FAST_S)
+    share = dt_s / max(FAST_S, MEAN_SAMPLES * dt_s)
     c.slower_v += share * (c.slow_v - c.slower_v)
     c.slower_a += share * (c.slow_a - c.slower_a)
     c.slow_v += share * (voltage_v - c.slow_v)

@@ -13,6 +13,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.sampling import Sampling
+from tests.estimator.anywhere.use import drive
 from tests.estimator.simulated_cell import TRUTH, measured, simulate_file
 
 HOUR = 3600
@@ -128,12 +129,35 @@ def test_a_coarse_voltage_with_a_configured_resolution_is_not_frozen() -> None:
     assert not (suspects & FROZEN_FAULTS).any()
 
 
+def two_levels(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Return a voltage that changes at random between two levels 13 mV apart, after three samples on average [V]."""
+    return 0.013 * (np.cumsum(rng.random(size) < 1 / 3) % 2)
+
+
+@pytest.mark.parametrize("step_s", [1, 5, 10])
+@pytest.mark.parametrize(
+    "noise", [lambda rng, size: rng.normal(0.0, 0.013, size), two_levels], ids=["white", "two levels"]
+)
 @pytest.mark.parametrize("current_a", [0.0, 0.3], ids=["exactly 0 A", "constant offset"])
-def test_a_noisy_voltage_of_a_parked_pack_is_no_frozen_current(current_a: float) -> None:
-    """The converter's noise exceeds the change of the voltage that proves a frozen current. It has no other cause than noise."""
+def test_a_noisy_voltage_of_a_parked_pack_is_no_frozen_current(
+    current_a: float, noise: Callable[[np.random.Generator, int], np.ndarray], step_s: int
+) -> None:
+    """The converter's noise reaches the change of the voltage that proves a frozen current. It has no other cause than noise."""
     driven_a = load_a(1200, (0.0, 10.0, 20.0))
     samples, _ = simulate_file(load_cell("nmc", PARKED_AH), np.r_[driven_a, np.full(6 * HOUR, current_a)], 0.8)
-    samples = samples[::5]
-    samples["voltage_v"] += np.random.default_rng(1).normal(0.0, 0.013, samples.size)
-    _, _, suspects = run(Estimator(load_cell("nmc", PARKED_AH), initial_soc=0.8, sampling=Sampling(5.0)), samples)
+    samples = samples[::step_s]
+    samples["voltage_v"] += noise(np.random.default_rng(1), samples.size)
+    estimator = Estimator(load_cell("nmc", PARKED_AH), initial_soc=0.8, sampling=Sampling(float(step_s)))
+    _, _, suspects = run(estimator, samples)
     assert not (suspects & FROZEN_FAULTS).any()
+
+
+@pytest.mark.parametrize("step_s", [1, 5, 10])
+def test_a_shunt_that_reads_zero_in_a_drive_is_detected_at_each_sampling_rate(step_s: int) -> None:
+    current_a = drive(np.random.default_rng(1), PARKED_AH, 0.4, HOUR)
+    samples, _ = simulate_file(load_cell("nmc", PARKED_AH), current_a, 0.9)
+    samples = samples[::step_s]
+    samples["current_a"][samples["time_s"] >= 0.25 * HOUR] = 0.0
+    estimator = Estimator(load_cell("nmc", PARKED_AH), initial_soc=0.9, sampling=Sampling(float(step_s)))
+    _, _, suspects = run(estimator, samples)
+    assert suspects[-1] & InputFault.CURRENT
