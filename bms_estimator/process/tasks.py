@@ -73,15 +73,6 @@ async def finish(task: asyncio.Task[None], timeout_s: float) -> None:
         await task
 
 
-async def finish(task: asyncio.Task[None], timeout_s: float) -> None:
-    """Wait until a task has ended, and cancel it after ``timeout_s``. Raise its exception."""
-    done, _ = await asyncio.wait([task], timeout=timeout_s)
-    if not done:
-        task.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await task
-
-
 async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:
     """Run coroutines until one ends, cancel the others, and raise the first exception of any of them."""
     tasks = [asyncio.ensure_future(coroutine) for coroutine in coroutines]
