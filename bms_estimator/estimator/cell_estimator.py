@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.kernels.cells.cell_filter import BIAS_V
-from bms_estimator.kernels.cells.records import BANK, CAPACITY, CELL, LEAK, RESISTANCE, SOC, STATES, ReadingFault
+from bms_estimator.kernels.cells.records import BANK_STATE, CAPACITY, CELL, LEAK, RESISTANCE, SOC, STATES, ReadingFault
 from bms_estimator.kernels.cells.step import run_cells
 from bms_estimator.model.arrays import Floats, Records
 from bms_estimator.model.sample import CellBlock, SampleBlock
@@ -81,7 +81,7 @@ class CellEstimator:
 
     Attributes:
         cells: State of the cells, shape (m,), dtype CELL; m is 0 before the first cell voltages.
-        bank: State that the cells share, shape (1,), dtype BANK.
+        bank: State that the cells share, shape (1,), dtype BANK_STATE.
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -96,7 +96,7 @@ class CellEstimator:
     def _start(self, count: int) -> None:
         """Begin without a state of ``count`` cells."""
         self.cells: Records = np.zeros(count, CELL)
-        self.bank: Records = np.zeros(1, BANK)
+        self.bank: Records = np.zeros(1, BANK_STATE)
         self._scratch = np.zeros(2 * count + STATES)
 
     @property
@@ -109,7 +109,7 @@ class CellEstimator:
 
         Args:
             cells: Shape (series,), dtype CELL.
-            bank: Shape (1,), dtype BANK.
+            bank: Shape (1,), dtype BANK_STATE.
         """
         if cells.size != self.cells.size:
             self._start(cells.size)
@@ -206,7 +206,7 @@ class CellEstimator:
         if not saved or not self._enabled:
             return ""
         cells, bank = saved.get("cells"), saved.get("bank")
-        if cells is None or bank is None or cells.dtype != CELL or bank.dtype != BANK or bank.shape != (1,):
+        if cells is None or bank is None or cells.dtype != CELL or bank.dtype != BANK_STATE or bank.shape != (1,):
             return "it was saved by another version"
         if cells.shape != (self._series,):
             return f"it has {cells.size} cells, and the pack has {self._series} in series"

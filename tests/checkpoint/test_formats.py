@@ -14,7 +14,7 @@ from bms_estimator.checkpoint import arrays_file, run_file, state_files
 from bms_estimator.edge import block
 from bms_estimator.fleet.worker.checkpoint import checkpoint_format
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
-from bms_estimator.kernels.cells.records import BANK, CELL
+from bms_estimator.kernels.cells.records import BANK_STATE, CELL
 from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
 
 
@@ -27,7 +27,7 @@ def test_formats_have_their_numbers() -> None:
 
 @pytest.mark.parametrize(
     ("layout", "digest"),
-    [(HISTORY_ROW, "253baf35d5eea4fd"), (CELL, "f67d32a2a2c02beb"), (BANK, "2aa7702d379485e9")],
+    [(HISTORY_ROW, "253baf35d5eea4fd"), (CELL, "f67d32a2a2c02beb"), (BANK_STATE, "2aa7702d379485e9")],
     ids=["history, format 1", "cells, format 8", "bank, format 8"],
 )
 def test_records_have_the_layout_of_their_format(layout: np.dtype[Any], digest: str) -> None:

@@ -14,7 +14,7 @@ from bms_estimator.checkpoint.arrays_file import HISTORY_SUFFIX, LOAD_SUFFIX
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.forecast.load_history import load_arrays
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
-from bms_estimator.kernels.cells.records import BANK as BANK_STATE
+from bms_estimator.kernels.cells.records import BANK_STATE
 from bms_estimator.kernels.cells.records import CELL as CELL_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields

@@ -30,7 +30,7 @@ from bms_estimator.fleet.worker.pack_state import (
 )
 from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.forecast.forecast import Forecast, unknown_values
-from bms_estimator.kernels.cells.records import BANK, CELL
+from bms_estimator.kernels.cells.records import BANK_STATE, CELL
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.payload import Payload
@@ -145,7 +145,7 @@ class BlockProcessor:
             valid = saved if is_same_config else without_observer(saved)
             cells = {"cells": self._unpacked.cells, "bank": self._unpacked.bank} if self._unpacked.cell_count else {}
             state = PackState(record=valid, curves=self._fits.curves_in_force(), cells=cells)
-            pack_type.cells.use_state(NO_CELL_STATES, np.zeros(1, BANK))
+            pack_type.cells.use_state(NO_CELL_STATES, np.zeros(1, BANK_STATE))
             outcomes = pack_type.pack.restore(state, self._gap_s(block))
             self._store_cells(pack_type)
             # the restored estimator has no last sample, and its counters begin at 0
@@ -168,7 +168,7 @@ class BlockProcessor:
         if unpacked.cell_count:
             cells.use_state(unpacked.cells, unpacked.bank)
         else:
-            cells.use_state(NO_CELL_STATES, np.zeros(1, BANK))
+            cells.use_state(NO_CELL_STATES, np.zeros(1, BANK_STATE))
 
     def _store_cells(self, pack_type: PackType) -> None:
         """Store the state of the single cells in the record if their number has changed, or they have other arrays."""

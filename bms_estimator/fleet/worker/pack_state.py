@@ -17,7 +17,7 @@ from bms_estimator.fleet.fits.messages import COMPARED
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
 from bms_estimator.kernels.alarms.records import ALARM, ALARMS
-from bms_estimator.kernels.cells.records import BANK, CELL
+from bms_estimator.kernels.cells.records import BANK_STATE, CELL
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields
@@ -129,7 +129,7 @@ def pack_dtype(cells: int) -> np.dtype[Any]:
     if not cells:
         return PACK_STATE
     parts = [(name, PACK_STATE[name]) for name in PACK_STATE.names or ()]
-    return np.dtype([*parts, (BANK_FIELD, BANK), (CELLS, CELL, (cells,))], align=True)
+    return np.dtype([*parts, (BANK_FIELD, BANK_STATE), (CELLS, CELL, (cells,))], align=True)
 
 
 class StateError(ValueError):
@@ -164,7 +164,7 @@ class UnpackedRecord:
 
     @property
     def bank(self) -> NDArray[np.void]:
-        """State that the single cells share, shape (1,), dtype ``BANK``."""
+        """State that the single cells share, shape (1,), dtype ``BANK_STATE``."""
         bank: NDArray[np.void] = self._words.view(pack_dtype(self.cell_count))[BANK_FIELD]
         return bank
 
@@ -247,7 +247,7 @@ class UnpackedRecord:
         if not {BANK_FIELD, CELLS} <= set(names):
             return
         bank, cells = previous[BANK_FIELD], previous[CELLS]
-        if bank.dtype == BANK and cells.dtype == CELL and cells.ndim == 2 and 0 < cells.shape[1] <= MAX_CELLS:
+        if bank.dtype == BANK_STATE and cells.dtype == CELL and cells.ndim == 2 and 0 < cells.shape[1] <= MAX_CELLS:
             self.start_cells(cells.shape[1])
             self.bank[...], self.cells[...] = bank, cells[0]
 

@@ -1,6 +1,6 @@
 """Kalman filter of one cell's deviations, with scalar measurements.
 
-``c`` is a record of CELL, ``b`` of BANK, ``p`` of EKF_SETTINGS.
+``c`` is a record of CELL, ``b`` of BANK_STATE, ``p`` of EKF_SETTINGS.
 """
 
 import math

@@ -6,7 +6,7 @@ balancer. ``response`` is the error that the filter's state would have, had a ch
 hypothesis. Without a change, the innovations are white, and ``score`` over the root of ``information`` has a standard normal
 distribution, so that the threshold needs no training.
 
-``c`` is a record of CELL, ``b`` of BANK.
+``c`` is a record of CELL, ``b`` of BANK_STATE.
 """
 
 import math

@@ -68,7 +68,7 @@ CELL = np.dtype(
 )
 """State of one cell."""
 
-BANK = np.dtype(
+BANK_STATE = np.dtype(
     [
         ("started", "i8"),  # 1: a sample was processed
         ("time_s", "f8"),  # time of the last sample [s]

@@ -70,7 +70,7 @@ def run_cells(
 
     Args:
         cells: Shape (m,), dtype CELL; updated.
-        bank: State that all cells share, shape (1,), dtype BANK; updated.
+        bank: State that all cells share, shape (1,), dtype BANK_STATE; updated.
         filter_settings: Shape (1,), dtype EKF_SETTINGS.
         balancing_v: Cell voltage from which a balancer may be active [V].
         times_s: Times of the samples [s], shape (n,).
@@ -97,7 +97,7 @@ def run_cells(
 def add_sample(cells: Records, b: Record, p: Record, cells_v: Floats, row: Record) -> bool:
     """Add a sample to the window. Return False if the pack's filter has no estimate.
 
-    ``b`` is a record of BANK, ``p`` of EKF_SETTINGS, ``row`` of TRACE.
+    ``b`` is a record of BANK_STATE, ``p`` of EKF_SETTINGS, ``row`` of TRACE.
     """
     if not math.isfinite(row.soc + row.soc_std + row.r_s_ohm + row.r_ts_ohm + row.r_tl_ohm):
         return False
@@ -137,7 +137,7 @@ def update_cells(
 ) -> None:
     """Update all cells by the means of a window, and begin the next window.
 
-    ``b`` is a record of BANK, ``p`` of EKF_SETTINGS. ``soc`` and ``soc_std`` are the pack's SOC at the end of the window and its std.
+    ``b`` is a record of BANK_STATE, ``p`` of EKF_SETTINGS. ``soc`` and ``soc_std`` are the pack's SOC at the end of the window and its std.
     ``run_cells`` describes ``cells``, ``balancing_v`` and ``scratch``.
     """
     m = cells.size
@@ -212,7 +212,7 @@ def update_cell(
 
     Args:
         c: The cell; updated.
-        b: Window, dtype BANK.
+        b: Window, dtype BANK_STATE.
         slope_v: Derivative of the deviation by the cell's SOC [V].
         drop_v: Overpotential of the reference cell, which is a cell by the model of the pack [V].
         innovation_v: Innovation [V].
@@ -248,7 +248,7 @@ def update_cell(
 
 @njit(cache=True)
 def balancing_soc_variance(b: Record, active: bool) -> float:
-    """Return the variance that a possible balancer adds to a cell's SOC in the window ``b``, dtype BANK.
+    """Return the variance that a possible balancer adds to a cell's SOC in the window ``b``, dtype BANK_STATE.
 
     A balancer drains the same cells for hours. The std therefore grows in proportion to the time.
     """
