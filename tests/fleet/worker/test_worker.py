@@ -107,14 +107,15 @@ async def test_states_and_hour_rows_after_kills_are_those_of_one_run_over_the_st
             await heartbeats.until_held(PARTITIONS, *workers)
             edges.last = int(edges.first_unsent.max()) + BLOCKS_AFTER_KILLS
             processed_blocks = 0
-            while processed_blocks < edges.last * PACKS:  # a busy machine may take longer than the limit of one wait
-                try:
-                    async with asyncio.timeout(2.0 * RESEND_S):
-                        await heartbeats.until(lambda last, before=processed_blocks: count(last) > before)
-                except TimeoutError:  # a worker requests a missing block again only when later ones arrive
-                    edges.last += REQUEST_EVERY
-                processed_blocks = count(heartbeats.last)
-                assert count(heartbeats.last, "lethal") == 0
+            async with asyncio.timeout(5.0 * LONG_S):  # a busy machine may take longer than the limit of one wait
+                while processed_blocks < edges.last * PACKS:
+                    try:
+                        async with asyncio.timeout(2.0 * RESEND_S):
+                            await heartbeats.until(lambda last, before=processed_blocks: count(last) > before)
+                    except TimeoutError:  # a worker requests a missing block again only when later ones arrive
+                        edges.last += REQUEST_EVERY
+                    processed_blocks = count(heartbeats.last)
+                    assert count(heartbeats.last, "lethal") == 0
         assert processed_blocks == edges.last * PACKS
         stop.set()
         sys.stdout.write(f"{NODES} nodes, kills: {dict(kills)}; {await publisher_task}\n")
