@@ -18,6 +18,7 @@ from bms_estimator.estimator.filter_settings import CURVE_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, REFERENCE_C
 from bms_estimator.kernels.kalman_filter.hypotheses import MAX_STD_OF_ONE_HYPOTHESIS, spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.mixture import mixture_moments
+from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import SOC
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
@@ -81,6 +82,7 @@ PARTS: dict[str, Change] = {
     "error of the OCV": change_settings(curve_error_v=0.0, constant_error_v=0.0, varying_error_v=0.0),
     "learned OCV": let_ocv_error_vary,
     "learned OCV and capacity": change_settings(learning_soc=0.0),
+    "level of a plateau": change_settings(node_correlation=NODE_CORRELATION),
     "larger error at the knees of the OCV": change_settings(curve_soc=CURVE_SOC),
     "hysteresis": change_settings(hysteresis_v=0.0),
     "offset": change_settings(offset_c=0.0),

@@ -95,6 +95,10 @@ REINITIALIZED_STD = 0.2
 """Std of the SOC after a re-initialization, equal to the default at switch-on."""
 PROBIT = 1.702
 """Factor with which the logistic function of a deviation in std approximates its normal probability within 0.01."""
+REPEATED_SHARE = 3.0
+"""Factor on the relative growth of the model's errors outside the temperature range of the cell file, by which ln S counts in repeated
+updates. It counts in full from 10 K outside, where the resistances differ so much from those of the file that a hypothesis near empty
+fits any voltage."""
 MIN_PROBABILITY = 1e-12
 """Minimum prior probability of a hypothesis, so that its logarithm is finite."""
 EXCHANGE_STDS = 3.0
@@ -360,7 +364,8 @@ def repeated_variance(s: Record, p: Record, likeliest_v2: float, linear_v2: floa
 
     S contains errors that persist from update to update, as that of the curve at a knee. Repeated each second, the term ln S would
     reject a true SOC at the end of a plateau although it predicts each voltage. Therefore the variance that makes the innovation
-    likeliest replaces S. Outside the temperature range of the cell file S remains, because innovations are not smaller there.
+    likeliest replaces S. Outside the temperature range of the cell file S remains by ``REPEATED_SHARE``, because innovations are not
+    smaller there.
 
     Args:
         s: Record of EKF_STATE.
@@ -370,9 +375,8 @@ def repeated_variance(s: Record, p: Record, likeliest_v2: float, linear_v2: floa
         variance_v2: R [V^2].
     """
     likeliest_v2 = min(linear_v2, max(variance_v2, likeliest_v2))
-    usual = p.min_innovation_scale
-    share = (usual * extrapolation_factor(p, s.temperature_c) ** 2 - usual) / (1.0 - usual)
-    return likeliest_v2 * (linear_v2 / likeliest_v2) ** min(share, 1.0)
+    share = min(REPEATED_SHARE * (extrapolation_factor(p, s.temperature_c) - 1.0), 1.0)
+    return likeliest_v2 * (linear_v2 / likeliest_v2) ** share
 
 
 @njit(cache=True)
