@@ -96,9 +96,8 @@ REINITIALIZED_STD = 0.2
 PROBIT = 1.702
 """Factor with which the logistic function of a deviation in std approximates its normal probability within 0.01."""
 REPEATED_SHARE = 3.0
-"""Factor on the relative growth of the model's errors outside the temperature range of the cell file, by which ln S counts in repeated
-updates. It counts in full from 10 K outside, where the resistances differ so much from those of the file that a hypothesis near empty
-fits any voltage."""
+"""Weight of ln S in repeated updates, per relative growth of the model's errors outside the temperature range of the cell file. The weight
+is 1 from 10 K outside. There the resistances are so uncertain that a hypothesis near empty fits every voltage."""
 MIN_PROBABILITY = 1e-12
 """Minimum prior probability of a hypothesis, so that its logarithm is finite."""
 EXCHANGE_STDS = 3.0

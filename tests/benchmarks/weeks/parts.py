@@ -11,6 +11,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.anchors import EMPTY
+from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.pack_model import equations, fit, handover, history, intervals, prediction, prior
 from bms_estimator.pack_model.aging import Aging
 from bms_estimator.pack_model.cell_curves import CellCurves
@@ -162,6 +163,7 @@ PARTS: dict[str, Part] = {
     "end of an interval by the std of its charge": Part(((intervals, "COUNTED_STD", np.inf),)),
     "links across gaps": Part(((Links, "of", links_without_gaps),)),
     "charge hidden in a gap, in the slow fit": Part((set_in_curves(event_probability=0.0),)),
+    "level of a plateau, in the filter": Part(settings={"node_correlation": NODE_CORRELATION}),
     "any SOC after a gap, in the filter": Part(settings={"event_probability": 0.0}),
     "several starts": Part(((fit, "STARTS", fit.STARTS[:1]),)),
     "weights of minima with a small exponent": Part(((fit, "LIKELIHOOD_EXPONENT", 1.0),)),
