@@ -241,10 +241,12 @@ class MessageBuilder:
         """Return the last messages of a connection. The last of them is also the will."""
         return [self._retained(SENSOR_AVAILABILITY, b"offline"), self._retained(AVAILABILITY, b"offline")]
 
-    def availability(self, sent: PublishedState) -> list[Message]:
-        """Return both availabilities, which another client may have overwritten."""
+    def corrections(self, sent: PublishedState) -> list[Message]:
+        """Return both availabilities and all alarms, which another client may have overwritten."""
+        alarms = sent.snapshot.alarms if sent.snapshot else ()
         sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
-        return [self._retained(AVAILABILITY, b"online"), *sensor]
+        alarm_messages = [self._retained(f"alarm/{alarm.name}", alarm.json_bytes) for alarm in alarms]
+        return [self._retained(AVAILABILITY, b"online"), *sensor, *alarm_messages]
 
     def guaranteed_messages(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
         """Return the messages of a snapshot that must reach the broker, late if necessary, with their own timestamps.
