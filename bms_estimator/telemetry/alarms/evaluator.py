@@ -151,9 +151,9 @@ class AlarmEvaluator:
         if definition is None or silent_s < definition.limit:
             return
         alarms.states["cause_cleared"][LINK_LOST] = 0  # the cause of a latched alarm has returned
-        if not alarms.is_raised("link_lost"):
+        if reason or not alarms.is_raised("link_lost"):  # a source may know the reason only after the alarm was raised
             alarms.causes.set_texts("link_lost", *([reason] if reason else []))
-            alarms.raise_at("link_lost", now_s, silent_s)
+        alarms.raise_at("link_lost", now_s, silent_s)
 
     def evaluate_hooks(self, failing: Sequence[str], passed_s: float, now_s: float, *, is_undone: bool = False) -> None:
         """Evaluate the alarm ``hook_failed``.
