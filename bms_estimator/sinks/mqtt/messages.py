@@ -154,10 +154,6 @@ SENSOR_AVAILABILITY = "sensor/availability"
 """Topic of the sensor's availability, below the device's topic."""
 VENUS = "venus"
 """Topic of the battery for Venus OS, below the device's topic."""
-ANNOUNCED_ALARMS = ("collapse_risk",)
-"""Alarms with an entity in Home Assistant before their first value, which follows only after minutes of load."""
-
-
 UNRETAINED = "parameters", "forecast"
 """Topics of ``changed_payloads`` whose messages are not retained."""
 
@@ -224,7 +220,6 @@ class MessageBuilder:
     ) -> None:
         self._venus_limits = venus_limits
         self._unwatched = tuple(name for name in ALARMS if name not in alarms)
-        self._announced = {name for name in ANNOUNCED_ALARMS if name in alarms}
         self.root = f"{base_topic}/{device}"
         self.commands: tuple[str, ...] = ()
         self._home_settings = home_assistant or HomeAssistantSettings()
@@ -291,7 +286,7 @@ class MessageBuilder:
         """Return the discovery data of a snapshot. The number of cells never decreases."""
         cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
         known_cells = sent.discovery_inputs.cells if sent.discovery_inputs else 0
-        names = {alarm.name for alarm in snapshot.alarms} | self._announced
+        names = {alarm.name for alarm in snapshot.alarms}
         alarms = tuple(name for name in ALARMS if name in names)
         return DiscoveryInputs(snapshot.info, max(cells, known_cells), alarms, self.commands, self._unwatched)
 

@@ -215,10 +215,7 @@ class AlarmEvaluator:
         return self._alarms.changes()
 
     def report(self) -> tuple[Alarm, ...]:
-        """Return all alarms that were ever watched, or whose value is not known.
-
-        An alarm that was raised since the last call is reported as raised, even if it has ended.
-        """
+        """Return all alarms whose quantities were ever measured, and those that are raised, as ``AlarmList.report`` does."""
         return self._alarms.report()
 
     @property
