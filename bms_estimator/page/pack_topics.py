@@ -13,16 +13,20 @@ from bms_estimator.store.history import epoch_s
 
 PACKS = "packs"
 """Key of the names of all packs and of the number of packs that are not shown."""
-STATE, PARAMETERS, RECENT, ELEMENTS = "state", "parameters", "recent", "elements"
-"""Topics of state and parameters, and two keys that exist only here: recent states, and elements over SOC."""
+STATE, PARAMETERS, EVENT, RECENT, ELEMENTS = "state", "parameters", "event", "recent", "elements"
+"""Topics of state, parameters and events, and two keys that exist only here: recent states, and elements over SOC."""
 SHOWN_TOPICS = frozenset(
-    {STATE, PARAMETERS, "forecast", "health", "cells", "info", "event", AVAILABILITY, SENSOR_AVAILABILITY}
+    {STATE, PARAMETERS, "forecast", "health", "cells", "info", EVENT, AVAILABILITY, SENSOR_AVAILABILITY}
 )
 ALARM = "alarm/"
 """Prefix of the topics of alarms."""
 ELEMENTS_OVER_SOC = frozenset({"r_s_ohm", "r_ts_ohm", "c_ts_farad", "r_tl_ohm", "c_tl_farad"})
 RECENT_STATES = 600
 """Maximum number of stored states of a pack."""
+RECENT_EVENTS = 50
+"""Maximum number of stored events of a pack, as many as the page lists."""
+MAX_EVENT_CHARACTERS = 4096
+"""Maximum length of a stored event, which only another publisher exceeds."""
 RECENT_STEP_S = 1.0
 """Minimum interval of the states that are stored for the curves of a new reader [s]."""
 MAX_AHEAD_S = 86_400.0
@@ -40,7 +44,7 @@ _Row = tuple[float, tuple[float | None, ...]]
 
 
 class PackTopics(LatestValues):
-    """Latest payloads of all packs, as JSON text in one line, by ``<pack>/<topic>``.
+    """Latest payloads of all packs, as JSON text in one line, by ``<pack>/<topic>``. The text of ``event`` lists the last events.
 
     Args:
         wall: Wall clock, seconds since 1970.
@@ -52,6 +56,7 @@ class PackTopics(LatestValues):
         self._topics: dict[str, dict[str, str]] = {}
         self._recent: dict[str, deque[_Row]] = {}
         self._elements: dict[str, dict[str, dict[int, tuple[float, float]]]] = {}
+        self._events: dict[str, deque[str]] = {}
 
     @property
     def packs(self) -> list[str]:
@@ -74,6 +79,11 @@ class PackTopics(LatestValues):
             return
         if isinstance(value, Payload):
             value = value.model_dump(include=_STORED_FIELDS.get(topic, set()))
+        if topic == EVENT and value is not None:
+            events = self._events.setdefault(pack, deque(maxlen=RECENT_EVENTS))
+            if len(text) <= MAX_EVENT_CHARACTERS:
+                events.append(text)
+            text = f"[{','.join(events)}]"
         if value is None:
             self._remove_topic(pack, topic)
         else:
@@ -90,6 +100,7 @@ class PackTopics(LatestValues):
             return
         self._recent.pop(pack, None)
         self._elements.pop(pack, None)
+        self._events.pop(pack, None)
         self._publish_packs()
 
     def set_hidden_count(self, count: int) -> None:

@@ -10,7 +10,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.history_query import HistoryQuery
-from bms_estimator.page.pack_topics import STATE, PackTopics
+from bms_estimator.page.pack_topics import EVENT, STATE, PackTopics
 from bms_estimator.page.page_server import Forecast, PageServer
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, changed_payloads
@@ -58,7 +58,7 @@ class PageSink:
     def publish(self, snapshot: Snapshot) -> None:
         """Store a snapshot for the page, without blocking."""
         for event in events(self._previous, snapshot):
-            self._hub.put(self._pack, "event", event)
+            self._hub.put(self._pack, EVENT, event)
         if snapshot.estimate:
             self._hub.put(self._pack, STATE, snapshot.estimate)
         for topic, payload in changed_payloads(self._previous, snapshot):

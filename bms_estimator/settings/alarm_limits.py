@@ -283,7 +283,7 @@ def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
 
 
 def _stack_defaults(cell: FuelCellModel) -> dict[AlarmName, _Default]:
-    """Return the defaults of a fuel cell, which has no cell voltages and must not be charged."""
+    """Return the defaults of a fuel cell, which has neither SOC nor cell voltages and must not be charged."""
     c = cell.cell
     return {
         "pack_over_voltage": _Default(c.voltage_max_v, 0.98 * c.voltage_max_v),
@@ -295,6 +295,8 @@ def _stack_defaults(cell: FuelCellModel) -> dict[AlarmName, _Default]:
         "discharge_over_current": _Default(c.current_max_a, CURRENT_CLEAR_FRACTION * c.current_max_a),
         "charge_over_current": _UNMONITORED,
         "charging_below_freezing": _UNMONITORED,
+        "soc_low": _UNMONITORED,
+        "stability_margin_low": _UNMONITORED,
         "weak_cell": _UNMONITORED,
         "collapse_risk": _UNMONITORED,
         "over_temperature": _Default(90.0, 85.0),

@@ -269,7 +269,7 @@ def test_entities_are_unavailable_from_the_kill_of_the_service_until_its_restart
     home: HomeAssistant, packs: Packs
 ) -> None:
     def pack_states(states: dict[str, Any]) -> set[str]:
-        """Return the states of all entities but the one that is unavailable until the first forecast."""
+        """Return the states of all entities but the one that is unknown until the first forecast."""
         entities = [entity for entity in states if ".bms_pack_" in entity and not entity.endswith("collapse_risk")]
         return {states[entity]["state"] for entity in entities}
 
@@ -280,11 +280,13 @@ def test_entities_are_unavailable_from_the_kill_of_the_service_until_its_restart
     assert number_state(states, SOC_ENTITY) == pytest.approx(50.0, abs=20.0)
 
 
-def test_collapse_risk_is_unavailable_until_its_first_value(home: HomeAssistant, broker: Broker) -> None:
-    publish_fast(broker, "early", iter([(0.0, CELL_SNAPSHOT)]), home)
+def test_collapse_risk_is_unknown_until_its_first_value(home: HomeAssistant, broker: Broker) -> None:
+    cleared = cleared_alarm("collapse_risk")
+    without_value = cleared.model_copy(update={"unknown_reason": "no value yet"})
+    publish_fast(broker, "early", iter([(0.0, CELL_SNAPSHOT._replace(alarms=(without_value,)))]), home)
     entity = "binary_sensor.bms_early_alarm_collapse_risk"
-    assert home.states()[entity]["state"] == "unavailable"
-    payload = cleared_alarm("collapse_risk").json_bytes
+    home.until(lambda states: states[entity]["state"] == "unknown")
+    payload = cleared.json_bytes
 
     async def publish() -> None:
         async with aiomqtt.Client("127.0.0.1", broker.port) as client:

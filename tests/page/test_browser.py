@@ -331,6 +331,7 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
             assert page_tab.errors == []
             origin = "/".join(page_tab.page.url.split("/")[:3])
             assert all(url.startswith(origin) for url in page_tab.requests), page_tab.requests
+        assert await own.page.locator("#events li").count() >= 2, "start and sensor_online came before the visitor"
         assert await own.page.get_by_role("tab").count() == 0
         assert await other.page.get_by_role("tab").count() == 2
 

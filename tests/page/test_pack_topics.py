@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from bms_estimator.page.event_stream import MAX_MESSAGE_BYTES, Reader
-from bms_estimator.page.pack_topics import RECENT_STATES, PackTopics
+from bms_estimator.page.pack_topics import MAX_EVENT_CHARACTERS, RECENT_EVENTS, RECENT_STATES, PackTopics
 from bms_estimator.store.history import epoch_s
 
 TIME = "2026-11-22T16:00:{:06.3f}Z"
@@ -34,6 +34,16 @@ async def test_new_reader_gets_the_last_values_of_all_packs():
     assert messages["attic/state"] == state(1.0)
     assert messages["cellar/availability"] == "online"
     assert messages["attic/recent"]["voltage_v"] == [13.0, 14.0]
+
+
+async def test_new_reader_gets_the_last_events_without_those_that_are_too_long():
+    hub = PackTopics()
+    for number in range(RECENT_EVENTS + 1):
+        hub.put("attic", "event", {"time": TIME.format(number)})
+    hub.put("attic", "event", {"text": "x" * MAX_EVENT_CHARACTERS})
+    with hub.reading() as reader:
+        messages = await read_message(reader)
+    assert messages["attic/event"] == [{"time": TIME.format(number)} for number in range(1, RECENT_EVENTS + 1)]
 
 
 async def test_slow_reader_gets_only_the_newest_values():

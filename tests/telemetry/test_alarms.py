@@ -27,6 +27,7 @@ from bms_estimator.protocols.base.device_clock import MAX_LEAD_S
 from bms_estimator.protocols.base.probe_check import probe_block
 from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms
 from bms_estimator.settings.alarms import ALARMS
+from bms_estimator.telemetry.alarms.alarm_list import NO_VALUE
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.cells import NO_FAULTY_CELL, CellAlarmInput, CellAlarmInputs
 from tests.telemetry.alarm_captures import (
@@ -183,7 +184,6 @@ async def test_a_healthy_pack_raises_no_alarm_and_alarms_of_unmeasured_quantitie
     reported = {alarm.name for alarm in result.snapshots[-1].alarms}
     assert set(ALARMS) - reported == {
         "hook_failed",
-        "weak_cell",
         *COMPARISONS,
         "cell_over_voltage",
         "cell_under_voltage",
@@ -651,6 +651,34 @@ def test_alarms_are_unwatched_during_silence_and_the_first_10_s_of_samples() -> 
         assert (over_voltage.watched, over_voltage.unwatched_reason) == (is_watched, None if is_watched else "no cable")
         assert reported["link_lost"].watched
         assert "over_temperature" not in reported, "it was never measured"
+
+
+def test_an_alarm_without_a_value_is_reported_before_during_and_after_an_outage() -> None:
+    """The report before the outage corrects a retained message that an earlier run left in an outage."""
+    alarms, reported = make_evaluator(), []
+    for silent_s, now_s in ((0.0, 20.0), (10.0, 30.0), (0.0, 60.0)):
+        if not silent_s:
+            add_samples(alarms, *np.arange(now_s - 20.0, now_s))
+        alarms.on_silence(silent_s, WALL_S, "no cable", now_s)
+        reported += [(alarm.watched, alarm.unknown_reason) for alarm in alarms.report() if alarm.name == "weak_cell"]
+    assert reported == [(True, NO_VALUE), (False, NO_VALUE), (True, NO_VALUE)]
+
+
+def test_an_alarm_of_which_a_quantity_was_never_measured_is_not_reported_when_another_one_is_lost() -> None:
+    alarms = make_evaluator()
+    add_samples(alarms, 0.0)
+    add_samples(alarms, *range(1, 20), current_a=NAN)
+    watched = {alarm.name: alarm.watched for alarm in alarms.report()}
+    assert not watched["discharge_over_current"]
+    assert "charging_below_freezing" not in watched, "no temperature was ever measured"
+
+
+def test_link_lost_names_the_reason_that_the_source_knows_later() -> None:
+    alarms = make_evaluator()
+    for reason in ("", "the publisher reports offline", ""):
+        alarms.on_silence(30.0, WALL_S, reason, 0.0)
+    (text,) = [alarm.text for alarm in alarms.report() if alarm.name == "link_lost"]
+    assert text.endswith("check the device, its power and its connection; the publisher reports offline")
 
 
 @pytest.mark.parametrize(("status", "watched"), [(SampleStatus.PROBE_FAULT, False), (SampleStatus(0), True)])

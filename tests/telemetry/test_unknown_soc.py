@@ -10,6 +10,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE
+from bms_estimator.telemetry.alarms.alarm_list import NO_VALUE
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC
 from tests.telemetry.alarm_captures import PACK, WALL_S, settings
@@ -114,7 +115,8 @@ def test_a_pack_without_a_margin_has_no_alarm_of_the_margin(
     assert pack.alarm("stability_margin_low").unknown_reason == reason
 
 
-def test_pack_without_an_soc_has_no_unknown_alarm() -> None:
+def test_alarms_of_a_pack_without_an_soc_have_no_value_yet() -> None:
     pack = Pack()
     pack.estimate(soc=np.nan, soc_std=np.nan)
-    assert {alarm.unknown_reason for alarm in pack.evaluator.report()} == {None}
+    assert {alarm.unknown_reason for alarm in pack.evaluator.report()} == {None, NO_VALUE}
+    assert pack.alarm("soc_low").unknown_reason == NO_VALUE

@@ -90,18 +90,20 @@ def update_quantities(
 def update_unwatched(alarms: Records, limits: Records, part: Records, log: Records, at_s: float) -> None:
     """Update the alarms that cannot be watched at ``at_s`` [s], because a quantity is lost or no samples arrive.
 
-    ``evaluate.evaluate`` describes the other arguments. A critical alarm whose delay runs stays unwatched, so that a relay does
-    not close before the alarm is raised.
+    ``evaluate.evaluate`` describes the other arguments. An alarm of which a quantity was never measured counts as watched, because
+    it could not be evaluated before either. A critical alarm whose delay runs stays unwatched, so that a relay does not close before
+    the alarm is raised.
     """
     a, b = alarms[0], part[0]
-    lost, measured = lost_quantities(a), 0
+    lost = lost_quantities(a)
+    measured = lost  # a quantity of which all values were unusable is lost without a measured value
     for q in range(QUANTITIES):
         measured |= (a.quantities[q].max_count > 0) << q
     for k in range(a.states.shape[0]):
         s, d = a.states[k], limits[k]
         is_held = s.unwatched and d.critical and s.holds and not s.raised
-        is_silent = b.is_silent and d.needs and not d.needs & ~measured
-        unwatched = 1 if d.monitored and (is_held or d.needs & lost or is_silent) else 0
+        is_missing = d.needs & lost != 0 or (d.needs != 0 and b.is_silent != 0)
+        unwatched = 1 if d.monitored and (is_held or (is_missing and not d.needs & ~measured)) else 0
         if unwatched != s.unwatched:
             s.unwatched = unwatched
             write_log(b, log, k, WATCH_CHANGED, at_s, 0.0, math.nan)

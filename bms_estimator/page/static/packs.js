@@ -5,7 +5,7 @@ import { $, text } from "./dom.js";
 const AHEAD_MS = 86_400_000; // a state further in the future has a wrong time
 const ROWS = 3600; // of recent states
 const COLUMNS = ["voltage_v", "voltage_estimate_v", "current_a", "soc", "soc_std", "innovation_v"];
-const MAX_EVENTS = 50;
+const MAX_EVENTS = 50; // as many as the server stores
 
 export const packs = new Map();
 /** Event stream of the server, connection of the server to a broker (null: none), and time at which the broker came back. */
@@ -27,7 +27,7 @@ class Pack {
 			return;
 		}
 		if (topic === "elements") { this.learned = value; return; }
-		if (topic === "event" && value) this.addEvent(value);
+		if (topic === "event") for (const event of value ?? []) this.addEvent(event);
 		this.topics[topic] = value;
 		if (topic === "state" && value) {
 			this.stateMs = Date.now();

@@ -154,10 +154,6 @@ SENSOR_AVAILABILITY = "sensor/availability"
 """Topic of the sensor's availability, below the device's topic."""
 VENUS = "venus"
 """Topic of the battery for Venus OS, below the device's topic."""
-ANNOUNCED_ALARMS = ("collapse_risk",)
-"""Alarms with an entity in Home Assistant before their first value, which follows only after minutes of load."""
-
-
 UNRETAINED = "parameters", "forecast"
 """Topics of ``changed_payloads`` whose messages are not retained."""
 
@@ -224,7 +220,6 @@ class MessageBuilder:
     ) -> None:
         self._venus_limits = venus_limits
         self._unwatched = tuple(name for name in ALARMS if name not in alarms)
-        self._announced = {name for name in ANNOUNCED_ALARMS if name in alarms}
         self.root = f"{base_topic}/{device}"
         self.commands: tuple[str, ...] = ()
         self._home_settings = home_assistant or HomeAssistantSettings()
@@ -241,10 +236,12 @@ class MessageBuilder:
         """Return the last messages of a connection. The last of them is also the will."""
         return [self._retained(SENSOR_AVAILABILITY, b"offline"), self._retained(AVAILABILITY, b"offline")]
 
-    def availability(self, sent: PublishedState) -> list[Message]:
-        """Return both availabilities, which another client may have overwritten."""
+    def corrections(self, sent: PublishedState) -> list[Message]:
+        """Return both availabilities and all alarms, which another client may have overwritten."""
+        alarms = sent.snapshot.alarms if sent.snapshot else ()
         sensor = [self._sensor(sent.snapshot.health)] if sent.snapshot else []
-        return [self._retained(AVAILABILITY, b"online"), *sensor]
+        alarm_messages = [self._retained(f"alarm/{alarm.name}", alarm.json_bytes) for alarm in alarms]
+        return [self._retained(AVAILABILITY, b"online"), *sensor, *alarm_messages]
 
     def guaranteed_messages(self, before: Snapshot | None, snapshot: Snapshot) -> list[Message]:
         """Return the messages of a snapshot that must reach the broker, late if necessary, with their own timestamps.
@@ -289,7 +286,7 @@ class MessageBuilder:
         """Return the discovery data of a snapshot. The number of cells never decreases."""
         cells = len((snapshot.estimate and snapshot.estimate.cells_v) or ())
         known_cells = sent.discovery_inputs.cells if sent.discovery_inputs else 0
-        names = {alarm.name for alarm in snapshot.alarms} | self._announced
+        names = {alarm.name for alarm in snapshot.alarms}
         alarms = tuple(name for name in ALARMS if name in names)
         return DiscoveryInputs(snapshot.info, max(cells, known_cells), alarms, self.commands, self._unwatched)
 

@@ -2,7 +2,8 @@
 
 ``publish`` queues states and events in the outbox and keeps the last snapshot; tasks send both, so that the event loop
 never waits for the broker. ``messages`` builds the messages, ``requests`` handles requests, ``mqtt.reconnect_loop``
-connects. A monitor corrects messages of other clients on the availability topics of the service and of its sensor.
+connects. A monitor detects messages of other clients on the availability topics of the service and of its sensor, and corrects
+these topics and those of the alarms.
 """
 
 import asyncio
@@ -83,7 +84,9 @@ class AvailabilityMonitor:
             loop.call_at(max(self._corrected_s + CORRECTION_S, loop.time()), self._wake)
 
     async def correct(self, publish: Callable[[Sequence[Message]], Awaitable[None]]) -> None:
-        """Publish the correct availabilities if one is wrong and ``CORRECTION_S`` has passed.
+        """Publish the correct messages if an availability is wrong and ``CORRECTION_S`` has passed.
+
+        A second service of the pack, which writes the availability at its end, has also overwritten the alarms.
 
         The correction is counted only after the broker's acknowledgment. A broker that shuts down publishes the will,
         which looks like another client's message, and acknowledges nothing.
@@ -185,7 +188,7 @@ class MqttSink:
         self._resend_retained = True
         self._wake = asyncio.Event()
         self._availability = AvailabilityMonitor(
-            lambda: self._messages.availability(self._sent), delivery, self._denied, self._wake.set, echo_s
+            lambda: self._messages.corrections(self._sent), delivery, self._denied, self._wake.set, echo_s
         )
         self._task: asyncio.Task[None] | None = None
 

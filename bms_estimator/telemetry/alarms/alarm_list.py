@@ -20,6 +20,8 @@ from bms_estimator.telemetry.alarms.saved_state import SavedState
 
 ALWAYS_WATCHED: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost", "alarm_state_lost"))
 """Alarms that are watched even before the first sample."""
+NO_VALUE = "no value yet"
+"""Reason why the value of an alarm is not known whose quantities are measured, for example before a bank has a reference."""
 
 
 class AlarmList:
@@ -144,20 +146,24 @@ class AlarmList:
         return changes
 
     def report(self) -> tuple[Alarm, ...]:
-        """Return all alarms that were ever watched, or whose value is not known.
+        """Return all alarms whose quantities were ever measured, which alone can become unwatched, and those that are raised.
 
-        An alarm that was raised since the last call is reported as raised, even if it has ended.
+        An alarm that was raised since the last call is reported as raised, even if it has ended. An alarm without a value is
+        reported as well, so that receivers learn that it is watched again, also after an outage of an earlier run.
         """
         unreported, self._unreported = self._unreported, {}
-        states, unknown = self.states, self.causes.unknown
-        raised = states["raised"].tolist()
+        states, raised = self.states, self.states["raised"].tolist()
+        max_counts = self.record["quantities"]["max_count"][0] * self.record["samples"]["started"][0]
+        measured = {QUANTITIES[q] for q in np.flatnonzero(max_counts)}
         is_reported = (states["has_value"] | states["raised"] | states["unwatched"]).tolist()
         return tuple(
             alarm_payload(definition, unreported[definition.name])
             if definition.name in unreported and not raised[k]
             else self._payload(k)
             for k, definition in self.definitions.by_position.items()
-            if is_reported[k] or definition.name in unknown or definition.name in ALWAYS_WATCHED
+            if is_reported[k]
+            or definition.name in ALWAYS_WATCHED
+            or (definition.kind.needs and measured.issuperset(definition.kind.needs))
         )
 
     def restore(self, saved: SavedState) -> None:
@@ -204,6 +210,8 @@ class AlarmList:
         if state["raised"]:
             raised, cause_cleared = _raised_alarm(*state[["since_s", "value"]].item()), bool(state["cause_cleared"])
         message = self.causes.message(definition.name, raised, cause_cleared=cause_cleared)
+        if definition.kind.needs and not (raised or state["has_value"]):
+            message = message._replace(unknown_reason=message.unknown_reason or NO_VALUE)
         latest = self._payloads.get(definition.name)
         if latest is None or latest[0] != message:
             latest = self._payloads[definition.name] = message, alarm_payload(definition, message)

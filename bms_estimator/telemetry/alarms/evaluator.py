@@ -151,9 +151,9 @@ class AlarmEvaluator:
         if definition is None or silent_s < definition.limit:
             return
         alarms.states["cause_cleared"][LINK_LOST] = 0  # the cause of a latched alarm has returned
-        if not alarms.is_raised("link_lost"):
+        if reason or not alarms.is_raised("link_lost"):  # a source may know the reason only after the alarm was raised
             alarms.causes.set_texts("link_lost", *([reason] if reason else []))
-            alarms.raise_at("link_lost", now_s, silent_s)
+        alarms.raise_at("link_lost", now_s, silent_s)
 
     def evaluate_hooks(self, failing: Sequence[str], passed_s: float, now_s: float, *, is_undone: bool = False) -> None:
         """Evaluate the alarm ``hook_failed``.
@@ -215,10 +215,7 @@ class AlarmEvaluator:
         return self._alarms.changes()
 
     def report(self) -> tuple[Alarm, ...]:
-        """Return all alarms that were ever watched, or whose value is not known.
-
-        An alarm that was raised since the last call is reported as raised, even if it has ended.
-        """
+        """Return all alarms whose quantities were ever measured, and those that are raised, as ``AlarmList.report`` does."""
         return self._alarms.report()
 
     @property

@@ -318,12 +318,6 @@ def cleared_alarm(name: str) -> Alarm:
     )
 
 
-def test_collapse_risk_is_announced_before_its_first_value_and_once() -> None:
-    snapshots = CELL_SNAPSHOT, CELL_SNAPSHOT._replace(alarms=(cleared_alarm("collapse_risk"),))
-    [message] = discoveries(*snapshots)
-    assert message["components"]["alarm_collapse_risk"]["state_topic"] == "bms/pack/alarm/collapse_risk"
-
-
 def test_monitored_alarms_stay_available_while_the_sensor_is_silent() -> None:
     [message] = discoveries(CELL_SNAPSHOT._replace(alarms=(cleared_alarm("soc_low"),)))
     component = message["components"]["alarm_soc_low"]

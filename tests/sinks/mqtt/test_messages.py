@@ -97,11 +97,11 @@ def test_parameters_are_published_from_the_first_sample_on():
     assert topics(messages)[0] == "parameters"
 
 
-def test_availability_messages_repeat_the_availabilities_published_last():
+def test_corrections_repeat_the_availabilities_published_last():
     _, silent = MESSAGES.live_messages(PublishedState(), snapshot(sensor_message="no board"), NOW)
-    payloads = {m.topic: m.payload for m in MESSAGES.availability(silent)}
+    payloads = {m.topic: m.payload for m in MESSAGES.corrections(silent)}
     assert payloads == {"bms/pack/availability": b"online", "bms/pack/sensor/availability": b"offline"}
-    assert topics(MESSAGES.availability(PublishedState())) == ["availability"]
+    assert topics(MESSAGES.corrections(PublishedState())) == ["availability"]
 
 
 def test_state_has_the_fields_of_the_published_schema_and_null_for_missing_values():

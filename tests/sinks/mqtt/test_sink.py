@@ -30,6 +30,7 @@ from bms_estimator.store.outbox import Outbox
 from tests.mosquitto import MOSQUITTO, Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S, until
+from tests.sinks.home_assistant.test_discovery import cleared_alarm
 from tests.sinks.sink_helpers import Sink
 from tests.sinks.snapshots import CELL_SNAPSHOT, snapshot
 
@@ -168,16 +169,19 @@ async def test_availability_is_online_after_a_half_open_connection(broker: Broke
 
 @pytest.mark.parametrize("forged", [b"offline", b"", b"nonsense"])
 @pytest.mark.parametrize("topic", ["bms/pack/availability", "bms/pack/sensor/availability"])
-async def test_availability_forged_by_another_client_is_corrected(
+async def test_availability_and_alarms_overwritten_by_another_client_are_corrected(
     broker: Broker, url: str, topic: str, forged: bytes
 ) -> None:
+    alarm, alarm_topic = cleared_alarm("soc_low"), "bms/pack/alarm/soc_low"
     async with Listener(broker) as live, Sink(url) as sink:
-        sink.mqtt.publish(CELL_SNAPSHOT)
+        sink.mqtt.publish(CELL_SNAPSHOT._replace(alarms=(alarm,)))
         await live.wait(DISCOVERY_TOPIC)
+        await live.publish(alarm_topic, b"another", qos=1, retain=True)
         await live.publish(topic, forged, qos=1, retain=True)
         await until(lambda: live.all(topic) == [b"online", forged, b"online"])
         async with Listener(broker) as late:
             assert await late.wait(topic) == b"online"
+        await until(lambda: live.all(alarm_topic) == [alarm.json_bytes, b"another", alarm.json_bytes])
     assert sink.delivery.corrections == 1
 
 
