@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LIMITS = {"bms_estimator": 46_466, "tests": 49_334}
+LIMITS = {"bms_estimator": 46_497, "tests": 49_366}
 
 
 def is_text(node: ast.stmt) -> bool:
