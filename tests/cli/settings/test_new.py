@@ -98,7 +98,7 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
         ("Cells in series", "4", "4: the device reports 8 cells in series"),
         ("Cells in series", "", "Cells in parallel"),
         ("Cells in parallel", "1.5", "1.5: must be a whole number"),
-        ("Cells in parallel", "", "This is 100 %"),
+        ("Cells in parallel", "", "The SOC is 100 %"),
         (
             "Voltage of the pack at which its charger stops",
             "3.5",
