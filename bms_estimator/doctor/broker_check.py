@@ -2,7 +2,7 @@
 
 The only message that is published is ``offline``, not retained, on the pack's availability topic, and only while no service
 of the pack is online. A test of other topics would send false values to their subscribers. A running service reports denied
-topics itself, in its health.
+topics itself, in its health, and whether samples arrive from its device.
 """
 
 import asyncio
@@ -11,6 +11,7 @@ import secrets
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 
+from bms_estimator.doctor import device_check
 from bms_estimator.doctor.finding import Finding, Level, Subject, fault, ok, warning
 from bms_estimator.mqtt.broker_config import Broker, brokers
 from bms_estimator.mqtt.client import Timeouts
@@ -31,14 +32,17 @@ ACCESS_LIST_REMEDY = "correct the broker's access list, for Mosquitto: deploy/mo
 
 
 def check_broker(subject: Subject) -> Iterator[Finding]:
-    """Yield whether brokers and fleet server can be reached, and which topics a broker denies.
+    """Yield whether brokers and fleet server can be reached, which topics a broker denies, and the health of a running service.
 
     Raises:
         UserError: A setting of ``[mqtt]`` or ``[edge]`` cannot be used.
     """
     pack = subject.settings.pack.name
     if mqtt := subject.settings.mqtt:
-        yield from _check_section(subject, mqtt, f"{mqtt.base_topic}/{pack}")
+        findings = list(_check_section(subject, mqtt, f"{mqtt.base_topic}/{pack}"))
+        yield from findings
+        if subject.is_running and all(finding.check != device_check.NAME for finding in findings):
+            yield device_check.NOT_EXAMINED
     if edge := subject.settings.edge:
         yield from _check_section(subject, edge, None)
 
@@ -56,12 +60,14 @@ def _check_section(subject: Subject, settings: BrokerSettings, pack_topic: str |
         unit = subject.unit.name if subject.unit else "bms-estimator"
         yield warning(NAME, text, f"read the log of the service: journalctl -u {unit}")
         return
-    yield from asyncio.run(_examine_all(settings, pack_topic))
+    remedy = device_check.silence_remedy(subject)
+    yield from asyncio.run(_examine_all(settings, pack_topic, remedy))
 
 
-async def _examine_all(settings: BrokerSettings, pack_topic: str | None) -> list[Finding]:
+async def _examine_all(settings: BrokerSettings, pack_topic: str | None, silence_remedy: str) -> list[Finding]:
     """Return the findings on all brokers, which are examined at the same time."""
-    results = await asyncio.gather(*(_examine(settings, broker, pack_topic) for broker in brokers(settings)))
+    checks = (_examine(settings, broker, pack_topic, silence_remedy) for broker in brokers(settings))
+    results = await asyncio.gather(*checks)
     has_connection = any(connection.level is Level.OK for connection, *_ in results)
     findings = []
     for connection, *rights in results:
@@ -71,14 +77,16 @@ async def _examine_all(settings: BrokerSettings, pack_topic: str | None) -> list
     return findings
 
 
-async def _examine(settings: BrokerSettings, broker: Broker, pack_topic: str | None) -> list[Finding]:
+async def _examine(
+    settings: BrokerSettings, broker: Broker, pack_topic: str | None, silence_remedy: str
+) -> list[Finding]:
     """Return the findings on one broker: first on the connection, then on the rights."""
     options = ConnectOptions(f"bms-doctor-{secrets.token_hex(4)}", will=None, on_message_lost=lambda *_: None)
     try:
         async with BrokerConnector(settings, TIMEOUTS)(broker, options) as connection:
             findings = [ok(NAME, f"{broker.url}: connected by {connection.protocol}")]
             if pack_topic:
-                findings += [finding async for finding in _examine_rights(connection, pack_topic)]
+                findings += [finding async for finding in _examine_rights(connection, pack_topic, silence_remedy)]
             return findings
     except BrokerConnectionError as error:
         section = settings.section
@@ -90,8 +98,8 @@ async def _examine(settings: BrokerSettings, broker: Broker, pack_topic: str | N
         return [fault(NAME, f"{broker.url}: {error}", remedy)]
 
 
-async def _examine_rights(connection: Connection, pack_topic: str) -> AsyncIterator[Finding]:
-    """Yield whether the pack's topics may be read and written."""
+async def _examine_rights(connection: Connection, pack_topic: str, silence_remedy: str) -> AsyncIterator[Finding]:
+    """Yield whether the pack's topics may be read and written, or the health of a running service."""
     topic = f"{pack_topic}/{AVAILABILITY}"
     denied = await connection.subscribe(f"{pack_topic}/request/+", [topic, f"{pack_topic}/health"])
     denied.pop(f"{pack_topic}/health", None)  # the service itself need not read it
@@ -99,7 +107,8 @@ async def _examine_rights(connection: Connection, pack_topic: str) -> AsyncItera
         yield fault(NAME, f"may not read {name}: {reason}", ACCESS_LIST_REMEDY)
     retained = await _retained_messages(connection)
     if retained.get(topic) == b"online":
-        yield _denied_topics_of_service(retained.get(f"{pack_topic}/health", b""))
+        for finding in _health_of_service(retained.get(f"{pack_topic}/health", b""), silence_remedy):
+            yield finding
         return
     rejection = await connection.publish(Message(topic, b"offline", 1, retain=False))
     if rejection:
@@ -133,12 +142,19 @@ async def _is_echoed(connection: Connection, topic: str) -> bool:
     return True
 
 
-def _denied_topics_of_service(health: bytes) -> Finding:
-    """Return the topics that the broker denies to the running service, according to its health message."""
+def _health_of_service(payload: bytes, silence_remedy: str) -> Iterator[Finding]:
+    """Yield the topics that the broker denies to the running service, and whether samples arrive, by its health message."""
     try:
-        topics = json.loads(health)["refused_topics"]
+        health = json.loads(payload)
+        topics, is_silent = health["refused_topics"], not health["sensor_online"]
     except (ValueError, KeyError, TypeError):  # its health may not be read
-        return ok(NAME, "the pack's service is online; its log names denied topics")
+        yield ok(NAME, "the pack's service is online; its log names denied topics")
+        return
     if topics:
-        return fault(NAME, f"the broker denies the running service: {', '.join(topics)}", ACCESS_LIST_REMEDY)
-    return ok(NAME, "the pack's service is online; the broker denies no topic")
+        yield fault(NAME, f"the broker denies the running service: {', '.join(topics)}", ACCESS_LIST_REMEDY)
+    else:
+        yield ok(NAME, "the pack's service is online; the broker denies no topic")
+    if is_silent:
+        yield fault(device_check.NAME, f"no samples arrive: {health.get('sensor_message')}", silence_remedy)
+    else:
+        yield ok(device_check.NAME, "samples arrive at the running service; not opened")

@@ -32,6 +32,12 @@ SERIAL_REMEDY = "check cable, sensor.protocol and sensor.baud; see which device 
 """Remedy for a silent device on a serial port."""
 SOURCE_REMEDY = "check the device and the section [source]"
 """Remedy for a silent device that is not on a serial port."""
+NOT_EXAMINED = warning(
+    NAME,
+    "in use by the running service; not examined",
+    "see on the page or in the log of the service whether samples arrive, or stop it first",
+)
+"""Finding on the device of a running service whose health cannot be read."""
 CALIBRATION_FIELDS = STORED_FIELDS[1:]
 """Fields of a board's hello that its calibration changes."""
 
@@ -69,7 +75,8 @@ def check_device(subject: Subject) -> Iterator[Finding]:
     source = subject.settings.source
     name = source.short_description if source else subject.settings.sensor.port
     if subject.is_running:
-        yield ok(NAME, f"{name}: in use by the running service; not opened")
+        if subject.settings.mqtt is None:  # otherwise ``check_broker`` reads the service's health
+            yield NOT_EXAMINED
         return
     if source is None:
         try:
@@ -83,7 +90,7 @@ def check_device(subject: Subject) -> Iterator[Finding]:
     try:
         sample = asyncio.run(_first_sample(subject))
     except NoSampleError as error:
-        yield fault(NAME, str(error), SERIAL_REMEDY if source is None else SOURCE_REMEDY)
+        yield fault(NAME, str(error), silence_remedy(subject))
         return
     yield ok(NAME, f"{name}: {sample}")
     series = subject.model.cell.series_count
@@ -92,6 +99,11 @@ def check_device(subject: Subject) -> Iterator[Finding]:
         yield warning(NAME, text, "correct pack.series, or measure the other cells")
     if sample.board.get("bandgap_v"):
         yield from check_board(subject, sample.board)
+
+
+def silence_remedy(subject: Subject) -> str:
+    """Return the remedy for a silent device."""
+    return SERIAL_REMEDY if subject.settings.source is None else SOURCE_REMEDY
 
 
 def _port_holder(port: str) -> str | None:

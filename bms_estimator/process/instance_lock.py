@@ -93,7 +93,8 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
         process_id = process
         break
     raise TemporaryError(
-        f"{pack}: this pack is served already, by {f'process {process_id}' if process_id else 'another process'}"
+        f"{pack}: this pack is served already, by {f'process {process_id}' if process_id else 'another process'}; "
+        "stop it first"
     )
 
 

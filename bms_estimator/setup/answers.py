@@ -64,6 +64,12 @@ class Answers:
         return self.measured.voltage_v if self.measured else None
 
     @property
+    def device_capacity_ah(self) -> float | None:
+        """Capacity of the pack by its device [Ah]; None: it reports none."""
+        measured_ah = self.measured.capacity_ah if self.measured else None
+        return self.device.capacity_ah if measured_ah is None else measured_ah
+
+    @property
     def logins(self) -> Mapping[str, BrokerLogin]:
         """Brokers of the pack by section. The source uses the broker of ``[mqtt]`` unless it has its own."""
         source = None if self.device.broker == self.broker else self.device.broker

@@ -1,5 +1,6 @@
 """New pack: its settings file, and the command that runs its estimator."""
 
+import math
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,9 @@ from bms_estimator.settings.pack_file import create_pack_file
 from bms_estimator.settings.settings_template import settings_file
 from bms_estimator.setup.answers import Answers
 
+CAPACITY_TOLERANCE = 0.2
+"""Relative difference of the capacity to that of the device without a warning. A worn pack may have a fifth less than rated."""
+
 
 @dataclass(frozen=True)
 class NewPack:
@@ -23,6 +27,8 @@ class NewPack:
     """Model of the whole pack."""
     warnings: list[str]
     """Likely mistakes in the settings."""
+    password_files: list[Path]
+    """Files with the passwords for brokers."""
 
     @property
     def summary(self) -> str:
@@ -43,14 +49,18 @@ def create_pack(file: Path, answers: Answers) -> NewPack:
     pack = settings.pack
     cell = load_cell(pack.cell, pack.capacity_ah).pack(pack.series, pack.parallel)
     warnings = check_settings(settings, cell)
+    capacity_ah, device_ah = cell.cell.capacity_ah, answers.device_capacity_ah
+    if device_ah and not math.isclose(capacity_ah, device_ah, rel_tol=CAPACITY_TOLERANCE):
+        warnings.append(f"pack.capacity_ah: the pack has {capacity_ah:g} Ah, but its device reports {device_ah:g} Ah")
     create_pack_file(file, answers.tables)
-    for section, login in answers.logins.items():
-        path = file.with_name(answers.password_file(section))
+    logins = {answers.password_file(key): each for key, each in answers.logins.items() if each.password is not None}
+    password_files = {file.with_name(name): login for name, login in logins.items()}
+    for path, login in password_files.items():
         try:
             login.write_password(path)
         except OSError as error:
             raise UserError(f"{path}: the password cannot be written: {error.strerror}; write it there") from None
-    return NewPack(settings, cell, warnings)
+    return NewPack(settings, cell, warnings, list(password_files))
 
 
 def run_command(file: Path) -> str:

@@ -238,9 +238,7 @@ def _reports_soc(answers: Answers) -> bool:
 
 def _suggest_capacity(answers: Answers) -> str:
     """Return the capacity of the pack by the device, which is that of a cell unless cells are in parallel."""
-    measured_ah = answers.measured.capacity_ah if answers.measured else None
-    capacity_ah = answers.device.capacity_ah if measured_ah is None else measured_ah
-    return "" if capacity_ah is None else f"{capacity_ah:g}"
+    return "" if answers.device_capacity_ah is None else f"{answers.device_capacity_ah:g}"
 
 
 def _parse_broker(text: str, answers: Answers) -> object:
@@ -340,10 +338,11 @@ QUESTIONS = (
     ),
     Question(
         "device_soc_std",
-        "Standard deviation of the device's SOC, with which the estimate starts [%]",
+        "How far may the SOC of the device be wrong [%]",
         f"standard deviation of the SOC by the device, with which the estimate starts [%]; {NO_LIMIT}: it is not used",
         _parse_device_soc_std,
         lambda answers: DEVICE_SOC_STD if _reports_soc(answers) else NO_LIMIT,
+        explanation="The estimate starts from this SOC, with the error that you give as its standard deviation.",
         is_asked=_reports_soc,
     ),
     Question(

@@ -28,6 +28,8 @@ MODBUS_S = 3.0
 """Time within which a Modbus device sends its first sample [s]. It answers a request within a second."""
 MAX_WAITING = 10_000
 """Maximum number of received messages that wait to be read. A broker sends all retained messages at once."""
+BROKER_HINT = "a broker is searched by mqtt://HOST:PORT"
+"""Hint for a place without mqtt://, which is searched as a Modbus device."""
 BLUETOOTH = "bluetooth"
 """Place that stands for all Bluetooth devices nearby."""
 DEFAULT_BROKER = str(MqttSettings.model_fields["url"].default)
@@ -177,10 +179,12 @@ async def _search_modbus_host(place: str, result: SearchResult) -> None:
 async def _search_modbus(address: dict[str, object], name: str, result: SearchResult) -> None:
     if importlib.util.find_spec("pymodbus") is None:
         if "host" in address:  # a serial port is reported already
-            result.failures.append(f"{name}: Modbus was not searched: pip install 'bms_estimator[modbus]'")
+            remedy = f"pip install 'bms_estimator[modbus]'; {BROKER_HINT}"
+            result.failures.append(f"{name}: Modbus was not searched: {remedy}")
         return
     is_serial = "port" in address
     profiles = [name for name, table in MODBUS_PROFILES.items() if not is_serial or "baud" in table]
+    reasons = list[str]()
     for profile in profiles:
         source = {"kind": "modbus", "profile": profile, **address}
         device = FoundDevice(
@@ -189,14 +193,17 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
         try:
             values = await measure(device.settings, MODBUS_S)
         except UserError as error:
-            if "host" in address:
-                result.failures.append(f"{name}: {profile}: {error}")
+            reasons.append(f"{name}: {profile}: {error}")
         else:
             result.devices.append(
                 FoundDevice(
                     device.name, device.description, device.tables, voltage_v=values.voltage_v, values=str(values)
                 )
             )
+    if not is_serial:
+        result.failures += reasons
+        if len(reasons) == len(profiles):
+            result.failures.append(f"{name}: no Modbus device; {BROKER_HINT}")
 
 
 async def _search_bluetooth(result: SearchResult) -> None:

@@ -23,6 +23,8 @@ CHECK_INTERVAL_S = 1.0
 """Interval between two checks for silence and faults [s]."""
 SILENT_PERIODS = 3.0
 """Number of sample periods without a sample after which a source counts as silent."""
+NO_SAMPLE_YET = "connected, no sample yet"
+"""Reason for silence after a connection, unless producer or decoder know a fault."""
 
 log = structlog.get_logger(__name__)
 
@@ -122,6 +124,8 @@ class LineSource:
     @property
     def silence_reason(self) -> str | None:
         """Reason why no samples arrive; None while they arrive."""
+        if self._silence_reason == NO_SAMPLE_YET:
+            return f"{self._producer.name}: {self._producer.fault or self._decoder.fault or NO_SAMPLE_YET}"
         return self._silence_reason
 
     @property
@@ -219,7 +223,7 @@ class LineSource:
             return
         self._connections += 1
         self._connected, self._last_sample_s = True, self._monotonic()
-        self._silence_reason = f"{self._producer.name}: connected, no sample yet"
+        self._silence_reason = NO_SAMPLE_YET
         log.info("connected", source=self._producer.name)
 
     async def _watch(self) -> None:

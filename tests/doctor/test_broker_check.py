@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.doctor.broker_check import check_broker
+from bms_estimator.doctor.device_check import NOT_EXAMINED, SERIAL_REMEDY
 from bms_estimator.doctor.finding import Finding, Level, Subject
+from bms_estimator.process.instance_lock import instance_lock
 from tests.doctor.packs import subject
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener, password_broker
@@ -73,13 +75,28 @@ def test_the_access_list_of_the_docs_suffices(tmp_path: Path, restricted_broker:
 async def test_a_running_service_reports_denied_topics_and_is_not_disturbed(tmp_path: Path, broker: Broker) -> None:
     async with Listener(broker) as service:
         await service.publish("bms/house/availability", b"online", retain=True, qos=1)
-        await service.publish("bms/house/health", b'{"refused_topics": ["bms/house/state"]}', retain=True, qos=1)
+        health = b'{"refused_topics": ["bms/house/state"], "sensor_online": true}'
+        await service.publish("bms/house/health", health, retain=True, qos=1)
         findings = await asyncio.to_thread(lambda: list(check_broker(pack_at(tmp_path, broker.url))))
         await service.publish("end")
         await service.wait("end")
         assert service.all("bms/house/availability") == [b"online"]
-    assert levels(findings) == [Level.OK, Level.FAULT]
+    assert levels(findings) == [Level.OK, Level.FAULT, Level.OK]
     assert findings[1].text == "the broker denies the running service: bms/house/state"
+
+
+async def test_the_silent_device_of_a_running_service_is_a_fault(tmp_path: Path, broker: Broker) -> None:
+    pack = pack_at(tmp_path, broker.url)
+    with instance_lock(pack.state_folder, "house"):
+        *_, unknown = await asyncio.to_thread(lambda: list(check_broker(pack)))
+        async with Listener(broker) as service:
+            health = b'{"refused_topics": [], "sensor_online": false, "sensor_message": "no message on x"}'
+            await service.publish("bms/house/availability", b"online", retain=True, qos=1)
+            await service.publish("bms/house/health", health, retain=True, qos=1)
+            *_, silent = await asyncio.to_thread(lambda: list(check_broker(pack)))
+    assert unknown == NOT_EXAMINED
+    assert (silent.check, silent.level) == ("device", Level.FAULT)
+    assert (silent.text, silent.remedy) == ("no samples arrive: no message on x", SERIAL_REMEDY)
 
 
 def test_an_unreachable_broker_is_a_fault_unless_there_is_another_one(tmp_path: Path, broker: Broker) -> None:

@@ -220,6 +220,15 @@ def test_uninstall_keeps_settings_and_state_for_root(root, pack, capsys):
     assert [path.stat().st_gid for path in (state, root / "etc/bms-estimator/pack.toml")] == [0, 0]
 
 
+def test_uninstall_names_the_folders_of_the_user_and_the_command_for_home_assistant(root, pack, capsys, monkeypatch):
+    monkeypatch.setenv("SUDO_USER", "root")
+    (root / "root/.local/state/bms-estimator").mkdir(parents=True)
+    run(capsys, "install", "--root", root, pack)
+    out = run(capsys, "uninstall", "--purge", "--root", root)[1]
+    assert out.endswith("Remaining: /root/.local/state/bms-estimator\n")
+    assert "mosquitto_pub -t homeassistant/device/bms_NAME/config -r -n" in out
+
+
 def test_uninstall_with_purge_leaves_nothing(root, pack, capsys):
     run(capsys, "install", "--root", root, pack)
     (root / "var/lib/bms-estimator").mkdir(parents=True)

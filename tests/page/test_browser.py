@@ -318,7 +318,7 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
                 text = await page_tab.text(name)
                 await programs.live.wait_json("bms/attic/state", lambda s: f"{factor * s[published]:.1f}" == text)  # noqa: B023
             assert await page_tab.text("celllow") == "3.311 V · cell 1"
-            assert "in series" in await page_tab.page.inner_text("#what")
+            assert re.search(r"in series · nominal [\d.]+ V · ", await page_tab.page.inner_text("#what"))
             await page_tab.until(
                 "count => document.querySelectorAll('#params tr').length === count", count_parameters(parameters)
             )

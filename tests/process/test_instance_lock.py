@@ -32,7 +32,10 @@ def test_second_service_of_a_pack_is_rejected_but_not_of_another_name_or_folder(
     served = "^pack: this pack is served already, by "
     for _ in range(2):  # a released lock can be taken again
         with instance_lock(tmp_path, "pack"):
-            with pytest.raises(UserError, match=f"{served}process {os.getpid()}$"), instance_lock(tmp_path, "pack"):
+            with (
+                pytest.raises(UserError, match=f"{served}process {os.getpid()}; stop it first$"),
+                instance_lock(tmp_path, "pack"),
+            ):
                 pass
             for _ in range(5):  # the system reports the owner of the name only to the first connections
                 with pytest.raises(UserError, match=served), instance_lock(tmp_path, "pack"):
@@ -50,7 +53,10 @@ def test_service_that_does_not_listen_yet_holds_the_lock_until_it_ends(
 ) -> None:
     with socket.socket(socket.AF_UNIX) as starting:
         starting.bind(_name(tmp_path, "pack"))  # without listen, as in a process that is just starting
-        with pytest.raises(UserError, match=r"served already, by another process$"), instance_lock(tmp_path, "pack"):
+        with (
+            pytest.raises(UserError, match=r"served already, by another process; stop it first$"),
+            instance_lock(tmp_path, "pack"),
+        ):
             pass
         # the starting process ends while the lock waits between two attempts
         monkeypatch.setattr(time, "sleep", lambda _: starting.close())

@@ -305,7 +305,7 @@ def test_a_pack_that_another_process_serves_gives_exit_code_75(
     with instance_lock(state_home / "bms-estimator", "pack"):
         code, _, err = run(capsys, "run", pack_file(tmp_path, line, broker))
     assert code == os.EX_TEMPFAIL
-    assert err.endswith(f"error: pack: this pack is served already, by process {os.getpid()}\n")
+    assert err.endswith(f"error: pack: this pack is served already, by process {os.getpid()}; stop it first\n")
 
 
 @pytest.mark.thorough

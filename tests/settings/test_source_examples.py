@@ -23,8 +23,9 @@ def test_a_documented_example_is_accepted(
     document: str, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "mqtt-password").write_text("secret")
     tables = tomllib.loads(text)
+    if password_file := tables.get("mqtt", {}).get("password_file"):
+        (tmp_path / password_file).write_text("secret")
     settings = Settings.model_validate(tables)
     # Each example configures a source or a sensor.
     assert settings.model_dump(include={"source"}) or settings.sensor.model_fields_set

@@ -40,6 +40,13 @@ async def test_a_missing_broker_is_reported_with_the_reason() -> None:
     assert result.failures[0].startswith(f"{url}: ")
 
 
+async def test_a_host_without_a_scheme_is_reported_with_the_form_of_a_broker(monkeypatch) -> None:
+    monkeypatch.setattr(search_module, "MODBUS_PROFILES", {"victron-gx": {}})
+    monkeypatch.setattr(search_module, "MODBUS_S", 0.1)
+    *_, reason = (await search([f"127.0.0.1:{free_port()}"])).failures
+    assert reason.endswith("; a broker is searched by mqtt://HOST:PORT")
+
+
 async def test_each_invalid_place_is_reported_without_its_password_and_ends_no_other_search(tmp_path) -> None:
     addresses = ["ftp://x", "mqtt://user:secret@x", "mqtt://user:secret", "mqtt://x:0", "mqtt://x:70000", "mqtt://[::1"]
     hosts = ["gx:port", "gx:0", "gx:70000", "::1", "user:secret@gx", ""]

@@ -21,6 +21,14 @@ def test_invalid_settings_leave_no_file(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_another_capacity_than_that_of_the_device_is_a_warning(tmp_path):
+    device = FoundDevice("/dev/none", "JK-BMS", {"sensor": {"port": "/dev/none", "protocol": "jk"}}, capacity_ah=280.0)
+    answers = [Answers(device, None, f"pack{ah:g}", "lfp", ah, 8, 2) for ah in (140.0, 50.0)]
+    same, other = (create_pack(tmp_path / f"{each.name}.toml", each).warnings for each in answers)
+    text = "pack.capacity_ah: the pack has 100 Ah, but its device reports 280 Ah"
+    assert [text in warnings for warnings in (same, other)] == [False, True]
+
+
 async def test_a_second_search_ends_the_first(tmp_path, monkeypatch):
     ended = []
 

@@ -123,6 +123,14 @@ async def test_missing_and_invalid_lines_are_reported():
             taking.cancel()
 
 
+async def test_fault_of_a_producer_is_reported_from_its_connection_on():
+    class FaultyProducer(ScriptedProducer):
+        fault = "no message on x"
+
+    async with LineSource(FaultyProducer([CONNECTED]), TEXT, period_s=LONG_S) as source:
+        await wait_for_message(source, "a device: no message on x")
+
+
 async def test_error_that_is_a_bug_of_the_producer_is_raised():
     source = LineSource(ScriptedProducer([*lines(50.0), KeyError("bug")]), TEXT)
     async with source:

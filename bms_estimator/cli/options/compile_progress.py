@@ -1,6 +1,6 @@
 """Progress bar on stderr while kernels compile.
 
-Only a first start compiles kernels, for half a minute on two idle cores. Later starts load them from the cache.
+Only a first start compiles kernels, for about a minute on two idle cores. Later starts load them from the cache.
 """
 
 from collections.abc import Callable

@@ -18,6 +18,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.version import __version__
 
+USER_FOLDERS = (".local/state/bms-estimator", ".cache/bms_estimator")
+"""Folders in a home folder with state and compiled kernels of a pack that its user runs without the service."""
 Root = Annotated[
     Path,
     typer.Option(
@@ -78,11 +80,18 @@ def uninstall_command(
 ) -> None:
     """Stop and remove the service, its user, systemd units and udev rule. Settings and state remain. Requires root."""
     machine = _machine(root, "uninstall", ["--purge"] if purge else [])
-    program = _own_path()
+    program, has_settings = _own_path(), machine.path(places.PACK_FILE).exists()
     with _errors_of_files():
         remaining = uninstall(machine, purge=purge, report=_report)
+    home = Path(f"~{os.environ.get('SUDO_USER', 'root')}").expanduser()
+    of_user = (home / name for name in USER_FOLDERS)
+    remaining += [path for path in of_user if machine.path(path).exists()]
     if program.exists():
         remaining.append(program)
+    if has_settings:
+        typer.echo(
+            "\nTo remove a pack from Home Assistant: mosquitto_pub -t homeassistant/device/bms_NAME/config -r -n"
+        )
     typer.echo(f"\nRemaining: {', '.join(map(str, remaining)) or 'nothing'}")
 
 

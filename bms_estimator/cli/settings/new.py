@@ -134,6 +134,8 @@ def new(
         for warning in pack.warnings:
             typer.echo(f"warning: {warning}", err=True)
         typer.echo(f"{file}: written; {pack.summary}")
+        for path in pack.password_files:
+            typer.echo(f"{path}: written, mode 600; password for the broker")
         if estimate and measured:
             compile_ahead()
             load_kernels()

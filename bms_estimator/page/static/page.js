@@ -81,7 +81,7 @@ function drawStatus(pack) {
 function drawHead(pack) {
 	const { info, state } = pack.topics;
 	text($("name"), pack.name);
-	const facts = info ? [info.cell, `${info.series_count} in series`, f.volts(info.nominal_voltage_v), f.ampereHours(info.capacity_ah)] : [];
+	const facts = info ? [info.cell, `${info.series_count} in series`, `nominal ${+info.nominal_voltage_v.toPrecision(4)} V`, f.ampereHours(info.capacity_ah)] : [];
 	text($("what"), [...facts, state && `as of ${f.clock(new Date(state.time))}`].filter(Boolean).join(" · "));
 	for (const tab of $("packs").children) {
 		const here = tab.dataset.pack === pack.name;

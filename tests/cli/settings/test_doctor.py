@@ -45,7 +45,7 @@ def _empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def pack(tmp_path: Path, broker: Broker, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a settings file whose source is silent."""
-    monkeypatch.setattr("bms_estimator.doctor.device_check.FIRST_SAMPLE_S", 0.3)
+    monkeypatch.setattr("bms_estimator.doctor.device_check.FIRST_SAMPLE_S", 1.0)
     file = tmp_path / "pack.toml"
     file.write_text(PACK.format(url=broker.url, folder=tmp_path / "state"))
     return file
@@ -66,6 +66,7 @@ def test_each_finding_is_a_line_and_its_remedy_another(capsys: pytest.CaptureFix
     assert f"ok       settings      {pack}: house: lfp, 4 in series" in out
     lines = out.splitlines()
     (device,) = (number for number, line in enumerate(lines) if line.startswith("fault"))
+    assert "no message on bms" in lines[device]
     assert lines[device + 1].strip() == "remedy: check the device and the section [source]"
 
 

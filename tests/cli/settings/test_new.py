@@ -108,8 +108,8 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
         ("Voltage of the pack at which its BMS ends", "23", "Largest discharge current"),
         ("Largest discharge current", "-5", "-5.0: must be greater than 0"),
         ("Largest discharge current", "60 A", "Largest charge current"),
-        ("Largest charge current", "", "Standard deviation of the device's SOC"),
-        ("Standard deviation of the device's SOC", "", "MQTT broker"),
+        ("Largest charge current", "", "How far may the SOC of the device be wrong"),
+        ("How far may the SOC of the device be wrong", "", "MQTT broker"),
         ("MQTT broker", "localhost", "localhost: must be mqtt://host:port"),
         ("MQTT broker", "mqtt://localhost:99999", "mqtt://localhost:99999: Port out of range 0-65535"),
         ("MQTT broker", "none", "pack.toml: written; house: lfp, 8 in series"),
@@ -322,6 +322,7 @@ def test_a_publisher_at_a_broker_with_a_password_is_found_with_its_values(
     assert (code, err) == (0, "")
     assert re.search(rf"1  esphome-jk:jk-bms: .*{node_broker.url}; 5\d\.\d\d V, ", out)
     assert PASSWORD not in out
+    assert f"{file.with_name('house-mqtt.password')}: written, mode 600" in out
     check_settings_with_login(file, node_broker)
 
 
