@@ -27,7 +27,7 @@ BLOCK_BYTES = 800
 """Size of a block of 60 samples in ``RAW``, with the server's overhead [bytes]."""
 HOUR_ROW_BYTES = 1900
 """Size of an hourly summary in ``HOURS``, with the server's overhead [bytes]."""
-STATE_BYTES = 42_000
+STATE_BYTES = 46_000
 """Maximum size of a pack in a checkpoint [bytes]."""
 DAILY_STATE_BYTES = 26_000
 """Size of a pack in a checkpoint after 24 h, with a fit [bytes], which is nearly that of a daily checkpoint."""
