@@ -354,8 +354,8 @@ def test_missing_certificate_or_another_key_is_rejected(
 @pytest.mark.parametrize(
     ("text", "expected_code", "reason"),
     [
-        ("packs = 10_000_000\noutage_days = 365", 75, "streams: the streams need 4552780.0 GB, but may use only "),
-        ("packs = 10_000_000\ndisk_gb = 1e6", 75, "streams: the streams need 106420.0 GB, but may use only "),
+        ("packs = 10_000_000\noutage_days = 365", 75, "streams: the streams need 4552940.0 GB, but may use only "),
+        ("packs = 10_000_000\ndisk_gb = 1e6", 75, "streams: the streams need 106580.0 GB, but may use only "),
         ("packs = 10_000\ndisk_gb = 90", 2, "server.disk_gb = 90: the streams need 106.6 GB: increase disk_gb"),
     ],
 )
