@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 from bms_estimator.fleet.heartbeat import Heartbeat
 
-ALIVE_S = 5.0
-"""Time without a heartbeat after which a worker counts as lost [s]. It exceeds the 3 s after which other workers
+LOST_S = 5.0
+"""Time without a heartbeat after which a worker counts as lost [s]. It exceeds ``heartbeat.DEAD_S``, after which other workers
 take over."""
 LISTED_S = 300.0
 """Time for which a lost worker stays listed [s]."""
@@ -15,7 +15,7 @@ RATE_S = 10.0
 MAX_WORKERS = 256
 """Maximum number of workers. Heartbeats of further workers are ignored."""
 NO_WORKER = -1
-"""Index that stands for the worker of a partition that no worker owns."""
+"""Worker index of a partition that no worker owns."""
 
 
 class _Received(NamedTuple):
@@ -59,8 +59,8 @@ class FleetWorkers:
             for received in self._alive(now_s).values()
         ]
 
-    def unknown(self, now_s: float) -> tuple[int, list[str]]:
-        """Return the number of unknown packs, and some of their names."""
+    def unknown_packs(self, now_s: float) -> tuple[int, list[str]]:
+        """Return the number of packs that are missing in the table of packs, and some of their names."""
         alive = self._alive(now_s)
         count = sum(received[-1].heartbeat.unknown_count for received in alive.values())
         return count, sorted({name for received in alive.values() for name in received[-1].heartbeat.unknown})
@@ -104,7 +104,7 @@ class FleetWorkers:
         }
 
     def _alive(self, now_s: float) -> dict[str, deque[_Received]]:
-        return {name: received for name, received in self._by_worker.items() if received[-1].at_s >= now_s - ALIVE_S}
+        return {name: received for name, received in self._by_worker.items() if received[-1].at_s >= now_s - LOST_S}
 
 
 def _max_lag_s(received: deque[_Received]) -> float | None:

@@ -9,7 +9,7 @@ DEAD_S = 3.0
 
 
 class RefusedPartition(BaseModel):
-    """Partition that a worker leaves to others, because it cannot read the last checkpoint."""
+    """Partition that a worker does not claim, because it cannot read the last checkpoint."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -36,7 +36,7 @@ class Heartbeat(BaseModel):
     block_version: int = 1
     """Newest version of blocks that the worker reads; versions without this field read version 1."""
     refused: tuple[RefusedPartition, ...] = ()
-    """Partitions that the worker leaves to others, because it cannot read their last checkpoints."""
+    """Partitions that the worker does not claim, because it cannot read their last checkpoints."""
     leaving: bool = False
     """True while the worker releases its partitions before it ends."""
     partitions: tuple[int, ...] = ()
@@ -48,25 +48,25 @@ class Heartbeat(BaseModel):
     samples: int = 0
     """Number of processed samples since the worker's start."""
     faults: int = 0
-    """Blocks skipped because of an internal error since the worker's start; the log has the tracebacks."""
+    """Number of blocks skipped because of an internal error since the worker's start; the log has the tracebacks."""
     dead_letters: int = 0
     """Number of blocks that became dead letters since the worker's start (``nats.dead_letters``)."""
     lag_s: float | None = None
     """Largest lag since the previous heartbeat [s]: time from the arrival of a block's last sample at the edge to the
     processing of the block. None without a block."""
     counters: dict[str, int] = Field(default_factory=dict)
-    """Counters of the claimed partitions over all their workers, by name: resends, gaps, lost blocks, damaged blocks and others."""
+    """Sums of the counters in the states of the claimed partitions, by name, such as resends, gaps and lost blocks. They include
+    events of former workers."""
     events: dict[str, int] = Field(default_factory=dict)
-    """Numbers of the events that this worker has counted since its start, by name. Unlike ``counters``, they include former
-    partitions, and exclude the time before the claim of a partition."""
+    """Numbers of events in this worker since its start, by name. They include partitions that it has released."""
     unknown_count: int = 0
     """Number of packs with deferred blocks that are missing in the table of packs."""
     unknown: tuple[str, ...] = ()
     """Names of some unknown packs."""
     clock_error_count: int = 0
-    """Number of packs whose edge's clock is wrong (``worker.block_order``)."""
+    """Number of packs with a wrong clock at their edge (``worker.block_order``)."""
     clock_errors: dict[str, float] = Field(default_factory=dict)
-    """Errors of some of these clocks by pack [s], the largest ones; positive if ahead."""
+    """Largest errors of edges' clocks by pack [s]; positive if ahead."""
     waiting: int = 0
     """Number of messages that were received from the server and not processed yet."""
     hours_waiting: int = 0

@@ -9,6 +9,7 @@ from bms_estimator.model.payloads.payload import Payload
 HOUR_S = 3600
 """Length of an hour [s]."""
 Correlation = Annotated[float, Field(ge=-1.001, le=1.001)]
+"""Correlation coefficient, -1 to 1 up to rounding errors."""
 
 
 class Hour(Payload):
@@ -47,7 +48,7 @@ class Hour(Payload):
     temperature_c: float | None = Field(description="mean [C]; null without a sensor")
     temperature_min_c: float | None
     temperature_max_c: float | None
-    innovation_rms_v: float | None = Field(description="measured less predicted voltage [V]")
+    innovation_rms_v: float | None = Field(description="RMS of measured less predicted voltage [V]")
     stability_margin_min: float | None = Field(
         description="minimum of soc - max(delta_1, delta_2) in the hour, over samples that have a stability margin"
     )
@@ -86,8 +87,8 @@ class Hour(Payload):
     suspects: int = Field(description="bits of model.input_faults.InputFault")
     weakest_cell: int | None = Field(
         default=None,
-        description="number of the series cell whose SOC is most significantly below the mean (lowest deviation plus three std), from 1; "
-        "null before an estimate of the single cells, as are the following fields up to self_discharge_std_a",
+        description="number, from 1, of the series cell with the lowest sum of SOC deviation and three std; null before an estimate "
+        "of the single cells, as are the following fields up to self_discharge_std_a",
     )
     weakest_cell_soc_deviation: float | None = Field(
         default=None, description="SOC of weakest_cell less the mean SOC of the cells"

@@ -9,7 +9,7 @@ import pytest
 
 from bms_estimator.cli.fleet.serve import _nodes
 from bms_estimator.fleet.server.nats_config import Accounts, configuration
-from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_of
+from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_config
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.settings.fleet import FleetSettings
 from tests.deploy.test_unit import MAX_EXPOSURE, exposure, verify
@@ -53,7 +53,7 @@ def example_configuration(deploy: Path, number: int) -> str:
     accounts = Accounts(
         "OPERATOR", "SYSTEM", {"SYSTEM": "CLAIMS", **dict.fromkeys(map(str.upper, settings.tenants), "CLAIMS")}
     )
-    text = configuration(node_of(place, ServerSpec(settings, accounts)))
+    text = configuration(node_config(place, ServerSpec(settings, accounts)))
     return re.sub(r'"[^"]*/(fleet[a-z-]*\.(crt|key))"', r'"/run/credentials/bms-estimator-fleet.service/\1"', text)
 
 

@@ -32,7 +32,7 @@ SUSPECTED = {
     161: InputFault.OUTLIERS | InputFault.OCV,
 }
 """Suspected input faults by index of the pack."""
-STEP_S = 0.2
+OVERVIEW_S = 0.2
 """Update interval of the page [s]."""
 TOP_PX = 420
 """Height of the screenshots of the page in dark mode and of the stale page [px]."""
@@ -118,7 +118,9 @@ async def main() -> None:
         await load(nc, packs)
         hours = Path(temporary) / "hours"
         write_hours(hours, [pack.name for pack in packs if pack.name.startswith("home")][:300])
-        async with fleet_page(Server(cluster.url), PageSettings(listen="127.0.0.1:0"), hours, step_s=STEP_S) as url:
+        async with fleet_page(
+            Server(cluster.url), PageSettings(listen="127.0.0.1:0"), hours, overview_s=OVERVIEW_S
+        ) as url:
             working = asyncio.create_task(work(nc, packs))
             shooting = asyncio.create_task(shoot_all(url, kill))
             await asyncio.wait({shooting, asyncio.create_task(kill.wait())}, return_when=asyncio.FIRST_COMPLETED)

@@ -1,6 +1,6 @@
-"""Metrics of a fleet in the form of prometheus-client: names, meanings, and values from the state of the fleet.
+"""Metrics of a fleet for prometheus-client: names, descriptions, and values from the state of the fleet.
 
-A name with ``_total`` is a counter.
+A metric whose name ends in ``_total`` is a counter.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -61,8 +61,8 @@ class Definition(NamedTuple, Generic[S]):
     """Label of the values, if there are several."""
 
 
-def _of_streams(read: Callable[[StreamState], int | None]) -> Callable[[TenantState], Value]:
-    """Return a function that reads a number of each stream."""
+def _each_stream(read: Callable[[StreamState], int | None]) -> Callable[[TenantState], Value]:
+    """Return a function that calls ``read`` for each stream."""
 
     def values(state: TenantState) -> Mapping[str, float]:
         numbers = {name: read(stream) for name, stream in (state.streams or {}).items()}
@@ -146,9 +146,11 @@ TENANT: tuple[Definition[TenantState], ...] = (
         lambda s: s.problems and s.problems.alarms,
     ),
     Definition("bms_fleet_mqtt_sessions", "MQTT sessions, including those of disconnected edges", _mqtt_sessions),
-    Definition("bms_fleet_stream_messages", "Stored messages of a stream", _of_streams(lambda s: s.messages), "stream"),
-    Definition("bms_fleet_stream_bytes", "Size of a stream", _of_streams(lambda s: s.stored_bytes), "stream"),
-    Definition("bms_fleet_stream_max_bytes", "Maximum size of a stream", _of_streams(lambda s: s.max_bytes), "stream"),
+    Definition(
+        "bms_fleet_stream_messages", "Stored messages of a stream", _each_stream(lambda s: s.messages), "stream"
+    ),
+    Definition("bms_fleet_stream_bytes", "Size of a stream", _each_stream(lambda s: s.stored_bytes), "stream"),
+    Definition("bms_fleet_stream_max_bytes", "Maximum size of a stream", _each_stream(lambda s: s.max_bytes), "stream"),
 )
 """Metrics of a tenant."""
 
@@ -198,7 +200,6 @@ WORKER: tuple[Definition[Heartbeat], ...] = (
         lambda h: bool(h.trouble),
     ),
 )
-
 """Metrics of a worker, since its start."""
 
 

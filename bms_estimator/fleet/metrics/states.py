@@ -23,10 +23,10 @@ class StreamState:
 
 
 class Problems(NamedTuple):
-    """Numbers of packs of the table."""
+    """Numbers of packs in the table that need attention."""
 
     silent: int
-    """Packs without a summary for the time ``arrival_watch.SILENT_S``."""
+    """Packs without a summary for the time ``tenant_watch.SILENT_S``."""
     alarms: int
     """Packs with the alarm weak_cell or cell_short at the end of the last hour."""
 

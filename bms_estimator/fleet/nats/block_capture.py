@@ -13,7 +13,7 @@ from bms_estimator.edge.subjects import RAW_STREAM
 from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
 
-AHEAD_S = 3600.0
+MAX_CLOCK_LEAD_S = 3600.0
 """Maximum lead of an edge's clock over the server's clock [s]. A block may be stored this long before the time of its
 samples."""
 
@@ -25,7 +25,8 @@ MIN_YIELDED_SAMPLES = 65_536
 class BlockCapture:
     """Blocks of one pack, to be added in the order of the stream.
 
-    Blocks of a store that the edge has replaced by a newer store are skipped, because workers skip them too.
+    An edge numbers the blocks of its store, a queue on its disk. After a newer store, blocks of an earlier store are skipped, as
+    workers skip them.
 
     Args:
         since_s: Beginning of the time span [s since 1970].
@@ -33,15 +34,15 @@ class BlockCapture:
 
     Attributes:
         damaged: Number of messages that cannot be decoded.
-        repeated: Number of blocks that arrived more than once, or belong to a former store.
+        repeated: Number of blocks that arrived more than once, or belong to an earlier store.
     """
 
     since_s: float = -np.inf
     until_s: float = np.inf
     damaged: int = 0
     repeated: int = 0
-    _blocks: dict[tuple[int, int], bytes] = field(default_factory=dict)  # by store and number
-    _store: int = 0  # newest store
+    _blocks: dict[tuple[int, int], bytes] = field(default_factory=dict)  # by creation time of the store and number
+    _store: int = 0  # creation time of the newest store
 
     def add(self, data: bytes) -> None:
         """Add the next message of the pack."""
@@ -161,8 +162,8 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
         StreamError: The server does not respond, or has no such stream.
     """
     capture = BlockCapture(since_s, until_s)
-    # -inf, the default, is no date; None: from the first message on
-    first_s = None if since_s <= AHEAD_S else since_s - AHEAD_S
+    # without a beginning (-inf, which is no valid date) all messages are read
+    first_s = None if since_s <= MAX_CLOCK_LEAD_S else since_s - MAX_CLOCK_LEAD_S
     async for batch in read_stream(nc, RAW_STREAM, f"p.*.raw.{pack}", since_s=first_s):
         for message in batch:
             capture.add(message.data)

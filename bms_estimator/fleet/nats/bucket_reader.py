@@ -19,20 +19,20 @@ class BucketReader:
         bucket: Name of the bucket.
 
     Attributes:
-        lost: Keys that were read before, and that the bucket lacks since the server has lost it.
+        lost: Keys of an earlier bucket of this name, which the present bucket lacks because the server has lost data.
     """
 
     def __init__(self, nc: Client, bucket: str) -> None:
         self._nc, self._bucket = nc, bucket
         self._next_sequence = 1
-        self._created: object = None  # creation time of the stream with this sequence number
+        self._created: object = None  # creation time of the read stream
         self._keys = set[str]()  # also removed keys, which have a deletion marker
         self.lost = set[str]()
 
     async def read(self, set_value: Callable[[str, bytes | None], object]) -> None:
         """Call ``set_value`` with each changed key and its value; None: the key was removed.
 
-        A bucket with fewer keys than were read is read from its beginning: an erasure has purged some (``purge_keys``).
+        If the bucket has fewer keys than were read, because an erasure has purged some (``purge_keys``), all of it is read again.
 
         Raises:
             StreamError: The server does not respond, or has no such bucket.
@@ -42,24 +42,24 @@ class BucketReader:
         except nats.errors.Error as error:
             raise StreamError(f"the server rejects reading {stream_of(self._bucket)}: {error_text(error)}") from None
         # a new bucket of the same name numbers its messages from 1 again
-        is_other = info.created != self._created or info.state.last_seq + 1 < self._next_sequence
-        is_purged = not is_other and info.state.messages < len(self._keys)
-        first = 1 if is_other or is_purged else self._next_sequence
+        is_new_bucket = info.created != self._created or info.state.last_seq + 1 < self._next_sequence
+        is_purged = not is_new_bucket and info.state.messages < len(self._keys)
+        first = 1 if is_new_bucket or is_purged else self._next_sequence
         found, last = set[str](), first - 1
         async for batch in read_stream(self._nc, stream_of(self._bucket), subject_of(self._bucket, ">"), first=first):
             for message in batch:
-                key, data = entry(self._bucket, message)
+                key, data = parse_entry(self._bucket, message)
                 found.add(key)
                 set_value(key, data)
             last = batch[-1].sequence
         for key in self._keys - found if is_purged else ():
             set_value(key, None)
-        self.lost = (self.lost | self._keys if is_other else self.lost) - found
+        self.lost = (self.lost | self._keys if is_new_bucket else self.lost) - found
         self._keys = found if first == 1 else self._keys | found
         self._next_sequence, self._created = last + 1, info.created
 
 
-def entry(bucket: str, message: StoredMessage) -> tuple[str, bytes | None]:
+def parse_entry(bucket: str, message: StoredMessage) -> tuple[str, bytes | None]:
     """Return key and value of a message; the value None means that the key was removed."""
     is_removed = message.headers.get("KV-Operation") in _REMOVING_OPERATIONS or "Nats-Marker-Reason" in message.headers
     return message.subject.removeprefix(subject_of(bucket, "")), None if is_removed else message.data

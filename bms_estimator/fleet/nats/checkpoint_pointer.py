@@ -11,7 +11,7 @@ class CheckpointInfo(BaseModel):
     sequence: int
     """Stream sequence number of the last included message."""
     object: str
-    """Name of the whole checkpoint in the object store ``states``."""
+    """Name of the object with all packs, in the object store ``states``."""
     bytes: int
     """Size of this object [bytes]."""
     made_s: float
@@ -19,7 +19,7 @@ class CheckpointInfo(BaseModel):
     format: int = 1
     """Format of the bytes (``checkpoint_format.FORMAT``); versions without this field wrote format 1."""
     increments: tuple[str, ...] = ()
-    """Names of further objects, each of which contains the packs that were changed since the object before it."""
+    """Names of further objects, each with the packs that have changed since the previous object."""
     increment_bytes: int = 0
     """Total size of the increments [bytes]."""
 
@@ -37,13 +37,12 @@ class CheckpointPointer(BaseModel):
     worker: str = ""
     """Name of the owning worker."""
     next: str = ""
-    """Name of the object that this worker writes next. The object may already exist in part."""
+    """Name of the object that this worker writes next. Parts of it may already be stored."""
     kept: tuple[CheckpointInfo, ...] = ()
-    """Last checkpoint, and the previous one, with which it shares no object."""
+    """Last checkpoint, and an earlier one that shares no object with it."""
     daily: tuple[CheckpointInfo, ...] = ()
-    """First checkpoint of each of the last days, newest first, without increments. The objects of the newest ones may also be
-    in ``kept``."""
-
+    """First checkpoint of each of the last days, newest first, without increments. The newest ones may also be in
+    ``kept``."""
     unsaved_claims: int = 0
     """Number of claims since the last checkpoint or the last orderly release."""
 

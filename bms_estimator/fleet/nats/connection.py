@@ -39,7 +39,7 @@ _TEXT_BY_PART = {
 """Error texts by part of the library's error text, for errors that have no exception class of their own."""
 
 AUTH_TIMEOUT_S = 10
-"""Timeout of each authentication step [s], long enough for a slow line or many simultaneous reconnects. The server's
+"""Timeout of each authentication step [s], long enough for a slow link or many simultaneous reconnections. The server's
 default is 2 s."""
 
 CONNECT_RETRY_S = 1

@@ -31,7 +31,7 @@ class DeadPackReader:
 
     def __init__(self, nc: Client) -> None:
         self._js = nc.jetstream()
-        self._position = (0, 0)
+        self._position = (0, 0)  # last sequence number and number of messages of the stream
         self._dead_packs = DeadPacks()
 
     async def read(self) -> DeadPacks:

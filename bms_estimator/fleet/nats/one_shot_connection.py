@@ -29,8 +29,7 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
     """Connect without reconnecting. A lost connection ends the command.
 
     Raises:
-        UserError: The server does not respond or rejects the client, or a file cannot be read. Within the context, a
-            stream cannot be read.
+        UserError: The server does not respond or rejects the client, a file cannot be read, or a request in the context fails.
     """
     callback_errors = list[Exception]()
 
@@ -43,7 +42,7 @@ async def connected(server: str, creds: Path | None = None, ca: Path | None = No
             user_credentials=check_credentials_file(creds) if creds is not None else None,
             tls=tls_context(ca) if ca is not None else None,
             allow_reconnect=False,
-            max_reconnect_attempts=1,  # of each server that cannot be reached
+            max_reconnect_attempts=1,  # for each address
             reconnect_time_wait=RETRY_S,
             connect_timeout=CONNECT_TIMEOUT_S,
             flush_timeout=FLUSH_TIMEOUT_S,

@@ -50,7 +50,7 @@ async def read_stream(
         stream: Name of the stream; it must allow direct gets.
         subject: Subject of the messages; may have wildcards.
         first: First stream sequence number.
-        since_s: Wall clock from which on stored messages are read [s since 1970]; replaces ``first``.
+        since_s: Arrival time of the first message [s since 1970]; replaces ``first``.
 
     Raises:
         StreamError: The server does not respond or rejects the request.

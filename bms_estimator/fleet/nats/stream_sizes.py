@@ -1,4 +1,4 @@
-"""Sizes of a tenant's streams, from the number of packs and the days without workers that the streams must bridge.
+"""Sizes of a tenant's streams, from the number of packs and the longest outage of the workers.
 
 The sizes of a block, an hourly summary and a pack's state were measured with simulated packs at 1 Hz
 (``tests/fleet/nats/test_stream_sizes.py`` prints them).
@@ -20,9 +20,9 @@ DAY_S = 86_400
 DAY_BLOCKS = 1440
 """Number of minute blocks of a pack-day."""
 BLOCK_S = 60.0
-"""Duration of a block whose size is ``block_bytes`` [s]."""
+"""Duration of a minute block [s], whose size is ``block_bytes``."""
 FIXED_FRACTION = 0.3
-"""Fraction of the size of a minute block that a shorter block has without samples. Measured with 10 samples: 179 of 509 bytes."""
+"""Size of a block without samples, as a fraction of a minute block. A block of 10 samples has 179 bytes, one of 60 samples 509."""
 BLOCK_BYTES = 800
 """Size of a block of 60 samples in ``RAW``, with the server's overhead [bytes]."""
 HOUR_ROW_BYTES = 1900
@@ -30,7 +30,7 @@ HOUR_ROW_BYTES = 1900
 STATE_BYTES = 46_000
 """Maximum size of a pack in a checkpoint [bytes]."""
 DAILY_STATE_BYTES = 26_000
-"""Size of a pack in a checkpoint after 24 h, with a fit [bytes], which is nearly that of a daily checkpoint."""
+"""Size of a pack in a daily checkpoint [bytes], measured after 24 h with a fit."""
 HISTORY_BYTES = 1_000_000
 """Maximum size of a pack's history with its last fit [bytes]."""
 CELL_BLOCK_BYTES = 60
@@ -43,8 +43,8 @@ MAX_CELLS_BLOCK_BYTES = 4096
 CELL_STATE_BYTES = 400
 """Additional size of a pack in a checkpoint for each cell [bytes]."""
 LAST_CHECKPOINTS = 4
-"""Size of the last checkpoints of a partition, in whole checkpoints: two with increments of at most half their size, and the one
-that is being written."""
+"""Size of the last checkpoints of a partition, in checkpoints without increments: two with increments of at most half their size,
+and the one that is being written."""
 DAILY_CHECKPOINTS = 30
 """Maximum number of daily checkpoints of a partition."""
 MIN_STATES_BYTES = 256 << 20
@@ -62,7 +62,7 @@ class StreamSizes:
     history: int
     """Stream ``HISTORY``."""
     pack_blocks: int
-    """Maximum number of blocks of one pack in ``RAW``, not a size."""
+    """Maximum number of blocks of one pack in ``RAW``."""
 
     @property
     def total(self) -> int:
@@ -75,7 +75,7 @@ def stream_sizes(packs: int, outage_days: float, cells: int = 0, block_s: float 
 
     Args:
         packs: Number of packs of the tenant.
-        outage_days: Days without workers after which ``RAW`` still has all blocks, even if one pack sends blocks of the
+        outage_days: Time without workers for which ``RAW`` holds all blocks [days], even if one pack sends blocks of the
             maximum size once a minute.
         cells: Number of single cells of a pack whose voltages are sent.
         block_s: Duration of a block [s].

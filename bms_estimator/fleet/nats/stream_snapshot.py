@@ -1,7 +1,7 @@
 """Snapshot of a stream, and restoration of a stream from a snapshot.
 
 nats-py does not support these requests of the server (https://docs.nats.io/reference/jetstream/api/stream/restore). A snapshot
-contains the messages with their sequence numbers up to the last one at its begin, and the consumers with their positions. It does
+contains the messages that are stored when it begins, with their sequence numbers, and the consumers with their positions. It does
 not contain a message that is removed while the snapshot is sent.
 """
 
@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.stream_reader import StreamError
 RESPONSE_TIMEOUT_S = 30.0
 """Timeout of the response to a request or to a chunk [s]."""
 RESTORE_TIMEOUT_S = 3600.0
-"""Timeout of the response to the last chunk [s], before which the server writes all messages."""
+"""Timeout of the response to the last chunk [s]. The server writes all messages before it responds."""
 COMPLETE = "204"
 """Status of the message after the last chunk of a complete snapshot; earlier versions of the server send none."""
 
@@ -94,7 +94,7 @@ async def restore_stream(nc: Client, info: StreamInfo, chunks: Iterable[bytes]) 
             reply = await nc.request(subject, chunk, timeout=RESPONSE_TIMEOUT_S)
             if reply.data:
                 raise StreamError(f"{stream}: the server rejects the snapshot: {reply.data.decode(errors='replace')}")
-        _check(stream, json.loads((await nc.request(subject, b"", timeout=RESTORE_TIMEOUT_S)).data))
+        _raise_error(stream, json.loads((await nc.request(subject, b"", timeout=RESTORE_TIMEOUT_S)).data))
     except NatsTimeoutError:
         raise StreamError(f"{stream}: the server does not respond to the restoration") from None
 
@@ -111,10 +111,10 @@ async def _request(nc: Client, subject: str, request: dict[str, Any], stream: st
         raise StreamError(f"{stream}: the server has no streams for this account") from None
     except NatsTimeoutError:
         raise StreamError(f"{stream}: the server has not responded for {RESPONSE_TIMEOUT_S:g} s") from None
-    return _check(stream, json.loads(response.data))
+    return _raise_error(stream, json.loads(response.data))
 
 
-def _check(stream: str, response: dict[str, Any]) -> dict[str, Any]:
+def _raise_error(stream: str, response: dict[str, Any]) -> dict[str, Any]:
     if "error" in response:
         raise StreamError(f"{stream}: the server rejects the request: {response['error'].get('description', '')}")
     return response

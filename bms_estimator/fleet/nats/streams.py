@@ -1,7 +1,7 @@
 """Streams, buckets and consumers of one tenant.
 
-The stream ``RAW`` stores the blocks of samples that edges send, divided into partitions by pack. Each partition has a durable consumer, which the server pins to one worker at
-a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object buckets are streams with the
+The stream ``RAW`` stores the blocks of samples that edges send, divided into partitions by pack. Each partition has a durable
+consumer, which the server pins to one worker at a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object buckets are streams with the
 configuration that all clients give them (ADR-8, ADR-20).
 """
 
@@ -26,10 +26,10 @@ RAW_BYTES = 8 << 30
 RAW_AGE_S = 7 * 86_400.0
 """Default maximum age of a message in the stream ``RAW`` [s]."""
 UNLIMITED = -1
-"""Value of ``max_bytes`` that leaves a stream limited by the server's disk space only."""
+"""Value of ``max_bytes`` without a limit except the server's disk space."""
 HOURS_FRACTION = 1 / 16
 """Maximum size of the stream ``HOURS`` of hourly summaries, as a fraction of the maximum size of ``RAW``. If minute blocks of seven
-days fill ``RAW``, it holds the summaries of eleven days."""
+days fill ``RAW``, ``HOURS`` holds the summaries of eleven days."""
 HOURS_AGE_S = 30 * 86_400.0
 """Maximum age of a message in the stream ``HOURS`` [s]."""
 DEAD_FRACTION = 1 / 64
@@ -38,7 +38,7 @@ default."""
 DEAD_AGE_S = 30 * 86_400.0
 """Maximum age of a message in the stream ``DEAD`` [s]."""
 MAX_BLOCK_BYTES = 256 << 10
-"""Maximum size of a block in ``RAW`` [bytes]: 7,000 incompressible samples."""
+"""Maximum size of a block in ``RAW`` [bytes], that of 7,000 incompressible samples."""
 MAX_BATCH_BYTES = (1 << 20) - (16 << 10)
 """Maximum size of a batch in ``TELEMETRY`` [bytes]: the server's limit of a message, 1 MiB, less 16 KiB for the reason with which
 ``DEAD`` stores a rejected batch."""
@@ -50,8 +50,8 @@ MIN_PACK_BLOCKS = 60
 DUPLICATES_S = 3600.0
 """Time within which the server drops a message of ``HOURS`` or ``HISTORY`` whose id it has already seen [s]."""
 HISTORY_PACK_MESSAGES = 500
-"""Maximum number of stored messages of a pack in ``HISTORY``. With 12 rows each they exceed the 5,000 rows of a history."""
-GROUP = "w"
+"""Maximum number of stored messages of a pack in ``HISTORY``. With 12 rows each, they hold a history of 5,000 rows."""
+PRIORITY_GROUP = "w"
 """Priority group of the consumers."""
 PIN_S = 2.0
 """Time without a request after which a worker loses a partition [s]."""
@@ -272,7 +272,7 @@ async def _ensure_consumer(nc: Client, partition: int, replicas: int) -> None:
         "durable_name": name,
         "filter_subject": subjects.stored(partition),
         "ack_policy": "none",  # a worker continues after the last message that its checkpoint includes
-        "priority_groups": [GROUP],
+        "priority_groups": [PRIORITY_GROUP],
         "priority_policy": "pinned_client",
         "priority_timeout": _ns(PIN_S),
         "num_replicas": replicas,

@@ -1,4 +1,4 @@
-"""Share of the stream ``RAW`` that is filled by blocks after the last checkpoints of the partitions.
+"""Share of the stream ``RAW`` that blocks fill which no checkpoint includes.
 
 When it reaches 1, the stream drops blocks that no checkpoint includes, and the edges must send them again.
 """
@@ -18,20 +18,20 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer, pointer_key
 
 WARNING_SHARE = 0.5
-"""Share above which operators are warned."""
+"""Share above which a warning is logged and shown."""
 MIN_BLOCK_S = 1.0
 """Minimum duration of a block [s]. A pack reaches its limit of N stored blocks after N times this duration at the earliest."""
 MAX_CHECKED_PACKS = 3
 """Number of packs that are checked in each partition: those with the most stored blocks."""
 
 
-class Unsaved(NamedTuple):
+class UnsavedShare(NamedTuple):
     """Share of the stream that no checkpoint includes."""
 
     share: float = 0.0
     """Largest share by size, by age, or of the blocks that the stream stores of one pack; 0 to 1."""
     pack: str = ""
-    """Pack, if the share is that of its blocks."""
+    """Pack whose number of blocks has this share; empty for a share by size or age."""
     max_blocks: int = 0
     """Maximum number of stored blocks of a pack."""
 
@@ -53,10 +53,10 @@ class Unsaved(NamedTuple):
         return f"{text}: start workers, and set block_s of the server to the block_s of the edges"
 
 
-async def unsaved_blocks(nc: Client, partitions: Iterable[int]) -> Unsaved:
-    """Return the part of the stream from the first block after a checkpoint on.
+async def unsaved_blocks(nc: Client, partitions: Iterable[int]) -> UnsavedShare:
+    """Return the largest share of the stream, by size, age or number, that no checkpoint includes.
 
-    The size is computed with the mean size of all messages.
+    Sizes are computed from the mean size of all messages.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -69,7 +69,7 @@ async def unsaved_blocks(nc: Client, partitions: Iterable[int]) -> Unsaved:
     raw = await js.stream_info(subjects.RAW_STREAM)
     bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
     max_blocks = max(raw.config.max_msgs_per_subject or 0, 0)
-    oldest_sequence, oldest_s, of_pack = raw.state.last_seq + 1, now_s, Unsaved()
+    oldest_sequence, oldest_s, max_of_packs = raw.state.last_seq + 1, now_s, UnsavedShare()
     for partition in partitions:
         first = await _saved_sequence(bucket, partition) + 1
         message = await _message(js, subjects.stored(partition), first)
@@ -78,19 +78,19 @@ async def unsaved_blocks(nc: Client, partitions: Iterable[int]) -> Unsaved:
         oldest_s = min(oldest_s, _time_s(message, now_s))
         oldest_sequence = min(oldest_sequence, message.seq or oldest_sequence)
         if max_blocks and now_s - _time_s(message, now_s) > WARNING_SHARE * MIN_BLOCK_S * max_blocks:
-            of_pack = max(of_pack, await _unsaved_of_packs(js, partition, first, max_blocks))
+            max_of_packs = max(max_of_packs, await _unsaved_of_packs(js, partition, first, max_blocks))
     mean_bytes = raw.state.bytes / max(1, raw.state.messages)
     unsaved_bytes = mean_bytes * (raw.state.last_seq + 1 - oldest_sequence)
     max_bytes, max_age_s = raw.config.max_bytes or 0, raw.config.max_age or 0.0
     by_size = unsaved_bytes / max_bytes if max_bytes > 0 else 0.0
     by_age = (now_s - oldest_s) / max_age_s if max_age_s > 0.0 else 0.0
-    return max(Unsaved(min(1.0, max(by_size, by_age))), of_pack)  # compared by their shares
+    return max(UnsavedShare(min(1.0, max(by_size, by_age))), max_of_packs)  # compared by their shares
 
 
-async def _unsaved_of_packs(js: JetStreamContext, partition: int, first: int, max_blocks: int) -> Unsaved:
+async def _unsaved_of_packs(js: JetStreamContext, partition: int, first: int, max_blocks: int) -> UnsavedShare:
     """Return the largest unsaved share of a pack's limit in a partition.
 
-    The number of unsaved blocks is estimated by the fraction of the pack's time span that they cover.
+    The number of unsaved blocks is estimated from the part of the stored time span that they cover.
 
     Args:
         js: JetStream of the tenant.
@@ -100,14 +100,14 @@ async def _unsaved_of_packs(js: JetStreamContext, partition: int, first: int, ma
     """
     info = await js.stream_info(subjects.RAW_STREAM, subjects_filter=subjects.stored_raw(partition))
     counts = sorted((info.state.subjects or {}).items(), key=lambda each: -each[1])
-    result, now_s = Unsaved(), time.time()
+    result, now_s = UnsavedShare(), time.time()
     for subject, count in counts[:MAX_CHECKED_PACKS]:
         oldest, unsaved = await _message(js, subject, 1), await _message(js, subject, first)
         if oldest and unsaved:
             begin_s = _time_s(oldest, now_s)
             part = (now_s - _time_s(unsaved, now_s)) / (now_s - begin_s) if now_s > begin_s else 0.0
             share = min(1.0, part * count / max_blocks)
-            result = max(result, Unsaved(share, subject.rpartition(".")[2], max_blocks))
+            result = max(result, UnsavedShare(share, subject.rpartition(".")[2], max_blocks))
     return result
 
 

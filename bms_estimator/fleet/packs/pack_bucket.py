@@ -12,7 +12,7 @@ from nats.aio.client import Client
 from nats.js.errors import KeyWrongLastSequenceError
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.nats.bucket_reader import BucketReader, entry, stream_of, subject_of
+from bms_estimator.fleet.nats.bucket_reader import BucketReader, parse_entry, stream_of, subject_of
 from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StreamError, read_stream
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 
@@ -37,7 +37,7 @@ class WriteCounts:
 
 
 class PackBucket:
-    """Copy of the table, updated by polling. An error in a row is not raised: it makes the row's pack unknown.
+    """Copy of the table, updated by polling. A pack whose row has an error is unknown; no error is raised.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -73,8 +73,8 @@ class PackBucket:
 
         await self._readers[bucket].read(set_and_record)
 
-    async def follow(self, changed: Callable[[set[str]], None]) -> None:
-        """Poll for changes until cancelled; call ``changed`` with the packs whose row or cell has changed.
+    async def follow(self, on_change: Callable[[set[str]], None]) -> None:
+        """Poll for changes until cancelled; call ``on_change`` with the packs whose row or cell has changed.
 
         A failed poll is counted, and the next one includes its changes. If the server has lost the table, it is written again.
         """
@@ -82,7 +82,7 @@ class PackBucket:
             await asyncio.sleep(POLL_S)
             try:
                 if packs := await self.refresh():
-                    changed(packs)
+                    on_change(packs)
                 await self._write_lost()
             except (StreamError, nats.errors.Error) as error:
                 self.faults, self.fault = self.faults + 1, str(error)
@@ -93,7 +93,7 @@ class PackBucket:
         """Write the values that the server has lost, unless another process has written or removed them since.
 
         Raises:
-            StreamError: The server does not respond or rejects the request. The next call writes them.
+            StreamError: The server does not respond or rejects the request. The next call repeats the write.
         """
         for bucket, values in ((CELLS_BUCKET, self.packs.cell_files), (PACKS_BUCKET, self.packs.rows)):
             if lost := self._readers[bucket].lost & values.keys():
@@ -111,7 +111,7 @@ async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
     values = dict[str, bytes]()
     async for batch in read_stream(nc, stream_of(bucket), subject_of(bucket, ">")):
         for message in batch:
-            key, data = entry(bucket, message)
+            key, data = parse_entry(bucket, message)
             if data is None:
                 values.pop(key, None)
             else:
@@ -120,7 +120,7 @@ async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
 
 
 async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, remove: bool = False) -> WriteCounts:
-    """Write values to a bucket; unchanged ones are skipped.
+    """Write the values that differ from those in a bucket.
 
     Args:
         nc: Connection to the tenant's NATS account.

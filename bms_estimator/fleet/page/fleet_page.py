@@ -19,7 +19,7 @@ from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.process.tasks import end
 from bms_estimator.settings.page import PageSettings
 
-STEP_S = 2.0
+OVERVIEW_S = 2.0
 """Interval between two overviews of the fleet [s]."""
 QUERY_S = 600.0
 """Interval between two runs of the queries [s]."""
@@ -44,7 +44,7 @@ FILES = {
 
 @contextlib.asynccontextmanager
 async def fleet_page(
-    server: Server, settings: PageSettings, hours: Path | None = None, *, step_s: float = STEP_S
+    server: Server, settings: PageSettings, hours: Path | None = None, *, overview_s: float = OVERVIEW_S
 ) -> AsyncIterator[str]:
     """Serve the page while the context lasts.
 
@@ -52,7 +52,7 @@ async def fleet_page(
         server: Address of the fleet's server.
         settings: Address and access of the page.
         hours: Folder of the Parquet files for queries; None: without queries.
-        step_s: Interval between two overviews [s].
+        overview_s: Interval between two overviews [s].
 
     Yields:
         The page's address.
@@ -76,32 +76,32 @@ async def fleet_page(
         WebServer(settings, FILES, latest, {"/packs": packs, "/pack": pack}, retry=False) as page,
         FleetFeed(server, view, latest.set_link_state),
     ):
-        tasks = [asyncio.create_task(_send_overviews(view, latest, step_s), name="fleet page")]
+        tasks = [asyncio.create_task(_send_overviews(view, latest, overview_s), name="fleet page")]
         if hours is not None:
-            tasks.append(asyncio.create_task(_send_query_results(hours, latest), name="fleet questions"))
+            tasks.append(asyncio.create_task(_send_query_results(hours, latest), name="fleet queries"))
         try:
             yield page.url
         finally:
             await end(*tasks)
 
 
-async def _send_overviews(view: FleetView, latest: LatestValues, step_s: float) -> None:
-    """Send an overview every ``step_s``. Without a connection to the server the last overview stays on the page."""
+async def _send_overviews(view: FleetView, latest: LatestValues, overview_s: float) -> None:
+    """Send an overview every ``overview_s``. Without a connection to the server the last overview stays on the page."""
     while True:
         if view.listening:
             latest.set_value(FLEET_KEY, view.overview_json(time.monotonic(), time.time()))
-        await asyncio.sleep(step_s)
+        await asyncio.sleep(overview_s)
 
 
 async def _send_query_results(hours: Path, latest: LatestValues) -> None:
     """Run the queries every ``QUERY_S``.
 
-    A query of a large fleet takes seconds. The process ends only after the running query.
+    A query of a large fleet takes seconds. The process ends only after it, because a thread cannot be cancelled.
     """
-    from bms_estimator.fleet.page.query_results import PAGE_QUERIES, answer  # noqa: PLC0415 - only queries need duckdb
+    from bms_estimator.fleet.page.query_results import PAGE_QUERIES, run_page_query  # noqa: PLC0415 - only queries need duckdb
 
     while True:
-        results = {name: await asyncio.to_thread(answer, hours, name) for name in PAGE_QUERIES}
+        results = {name: await asyncio.to_thread(run_page_query, hours, name) for name in PAGE_QUERIES}
         latest.set_value(ANSWERS_KEY, json.dumps(results, allow_nan=False, separators=(",", ":")))
         await asyncio.sleep(QUERY_S)
 

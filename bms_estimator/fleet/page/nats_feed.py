@@ -97,7 +97,7 @@ class FleetFeed:
             self._set_link_state("internal error of the page, see its log; restart the page")
 
     async def _receive(self) -> None:
-        """Connect, subscribe, and follow table and hours. The library then reconnects and renews subscriptions.
+        """Connect, subscribe, poll the table, and read recent hours. The library reconnects and renews subscriptions by itself.
 
         Raises:
             UserError: The address cannot be used, or the server has closed the connection permanently.
@@ -110,21 +110,21 @@ class FleetFeed:
             await self._nc.subscribe(subject, cb=handler)
         self._set_link_state(None)
         # No TaskGroup: it cancels its tasks only once, and the library may swallow a cancellation.
-        await asyncio.gather(self._follow_table(self._nc), self._read_recent_hours(self._nc))
+        await asyncio.gather(self._poll_table(self._nc), self._read_recent_hours(self._nc))
 
     def _handlers(self) -> dict[str, Callable[[Msg], Coroutine[Any, Any, None]]]:
         view, clock = self._view, time.monotonic
 
         async def state(message: Msg) -> None:
             if len(message.data) <= MAX_BYTES:
-                view.packs.receive_state(_pack(message), message.data, clock())
+                view.packs.receive_state(_pack_name(message), message.data, clock())
 
         async def parameters(message: Msg) -> None:
             if len(message.data) <= MAX_BYTES:
-                view.packs.receive_parameters(_pack(message), message.data)
+                view.packs.receive_parameters(_pack_name(message), message.data)
 
         async def hour(message: Msg) -> None:
-            view.packs.receive_hour(_pack(message), message.data)
+            view.packs.receive_hour(_pack_name(message), message.data)
 
         async def worker(message: Msg) -> None:
             view.receive_worker(message.data, clock())
@@ -140,8 +140,8 @@ class FleetFeed:
             subjects.unknown(): unknown,
         }
 
-    async def _follow_table(self, nc: Client) -> None:
-        """Follow the table of packs and the dead letters."""
+    async def _poll_table(self, nc: Client) -> None:
+        """Poll the table of packs and the dead letters until cancelled."""
         bucket, dead_packs, view = PackBucket(nc), DeadPackReader(nc), self._view
 
         async def refresh() -> None:
@@ -179,9 +179,9 @@ class FleetFeed:
 
     def _set_link_state(self, trouble: str | None) -> None:
         if trouble is None:
-            self._view.begin(time.monotonic())
+            self._view.set_connected(time.monotonic())
         else:
-            self._view.end()
+            self._view.set_disconnected()
         self._on_link_change(trouble and f"{self._server.urls}: {trouble}")
 
 
@@ -193,5 +193,5 @@ def type_name(spec: PackSpec | str) -> str:
     return f"{spec.cell} {spec.series}s{spec.parallel}p{capacity}"
 
 
-def _pack(message: Msg) -> str:
+def _pack_name(message: Msg) -> str:
     return message.subject.split(".", 2)[1]

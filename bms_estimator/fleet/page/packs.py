@@ -1,6 +1,6 @@
 """Packs of a fleet for its page: live packs, distributions of SOC, and packs that need attention. No I/O.
 
-The newest state of each pack is stored as bytes and decoded on request. The ranked values are stored in columns.
+The newest state of each pack is stored as bytes and decoded on request. Its ranked values are also stored in columns.
 """
 
 import bisect
@@ -14,7 +14,7 @@ from pydantic_core import from_json
 
 from bms_estimator.model.input_faults import InputFault
 
-ALIVE_S = 180.0
+SILENT_S = 180.0
 """Time without a state after which a pack counts as silent [s]. A pack sends a block a minute."""
 MAX_LISTED = 20
 """Maximum number of packs in a list."""
@@ -23,7 +23,7 @@ MAX_TYPES = 8
 MAX_TYPE_INDEX = 65_535
 """Largest value of column ``type``. All types beyond this number share this index."""
 OTHER = "other types"
-"""Name of the combination of all further types."""
+"""Name of all types beyond the ``MAX_TYPES`` most frequent ones."""
 UNLISTED = "not in the table"
 """Name of the type of packs that are not in the table of packs."""
 SOC_EDGES = np.linspace(0.0, 1.0, 21)
@@ -51,12 +51,12 @@ Mask = NDArray[np.bool_]
 
 
 class Concern(NamedTuple):
-    """Criterion by which a pack needs attention."""
+    """Criterion for packs that need attention."""
 
     column: str
-    """Column of the ranking."""
+    """Column of ``ROW``."""
     limit: float
-    """Limit below which a pack is counted."""
+    """Value below which a pack needs attention."""
 
 
 CONCERNS = {
@@ -64,8 +64,9 @@ CONCERNS = {
     "soc": Concern("soc", limit=0.1),
 }
 """Criteria of live packs, by name. The smallest values are the worst."""
-MAX_STD = 0.05
-"""Standard deviation of SOC above which a live pack counts as uncertain. Each pack is uncertain in its first hours."""
+UNCERTAIN_STD = 0.05
+"""Standard deviation of SOC above which a live pack counts as uncertain. This is no concern, because every new pack is uncertain
+for hours."""
 
 
 class FleetPacks:
@@ -82,8 +83,8 @@ class FleetPacks:
         self.states, self.damaged = 0, 0
         """Number of received states; number of those that are not a JSON object."""
 
-    def list_pack(self, name: str, type_name: str | None) -> None:
-        """Set the type of a pack in the fleet's table, such as ``lfp 16s2p``; None removes it."""
+    def set_type(self, name: str, type_name: str | None) -> None:
+        """Set the type of a pack, such as ``lfp 16s2p``; None: the pack is not in the table of packs."""
         row = self._row(name)
         row["listed"] = type_name is not None
         row["type"] = self._types.setdefault(type_name or UNLISTED, min(len(self._types), MAX_TYPE_INDEX))
@@ -102,12 +103,12 @@ class FleetPacks:
         self._states[self._indexes[name]] = state
 
     def receive_parameters(self, name: str, parameters: bytes) -> None:
-        """Store a pack's newest parameters, compressed because they have some kilobytes."""
+        """Store a pack's newest parameters, compressed because they take some kilobytes."""
         self._row(name)
         self._parameters[name] = zlib.compress(parameters, 1)
 
     def receive_hour(self, name: str, hour: bytes) -> None:
-        """Store the input faults of the summary of a pack's hour."""
+        """Store the input faults in the summary of a pack's hour."""
         values = _object(hour)
         suspects = values.get("suspects") if values else None
         if isinstance(suspects, int) and 0 <= suspects < 65_536:
@@ -140,7 +141,7 @@ class FleetPacks:
 
         Args:
             now_s: Present time.
-            since_s: Start of uninterrupted reception. Packs count as silent only ``ALIVE_S`` after it.
+            since_s: Start of uninterrupted reception. Packs count as silent only ``SILENT_S`` after it.
 
         Returns:
             ``packs`` (counts), ``types`` (number and distribution of each), ``soc_std_edges`` (histogram edges; the last bin
@@ -148,16 +149,16 @@ class FleetPacks:
             any concern).
         """
         rows = self._rows[: len(self._names)]
-        alive = rows["heard_s"] > now_s - ALIVE_S
+        alive = rows["heard_s"] > now_s - SILENT_S
         counted = rows["listed"] | (rows["heard_s"] > -math.inf)
-        silent = counted & ~alive & (now_s - since_s > ALIVE_S)
+        silent = counted & ~alive & (now_s - since_s > SILENT_S)
         return {
             "packs": {
                 "known": int(counted.sum()),
                 "alive": int(alive.sum()),
                 "silent": int(silent.sum()),
                 "unlisted": int((counted & ~rows["listed"]).sum()),
-                "uncertain": int((alive & (rows["soc_std"] > MAX_STD)).sum()),
+                "uncertain": int((alive & (rows["soc_std"] > UNCERTAIN_STD)).sum()),
             },
             "types": self._types_overview(rows, counted, alive),
             "soc_std_edges": STD_EDGES[:-1].tolist(),

@@ -1,4 +1,4 @@
-"""Query results for the page of a fleet. The page runs the queries at intervals in a thread."""
+"""Query results for the page of a fleet."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ MAX_ROWS = 20
 """Maximum number of rows of a result."""
 
 
-def answer(folder: Path, name: str) -> dict[str, Any]:
+def run_page_query(folder: Path, name: str) -> dict[str, Any]:
     """Return the result of one of the queries in ``PAGE_QUERIES``.
 
     Args:
@@ -28,6 +28,6 @@ def answer(folder: Path, name: str) -> dict[str, Any]:
         result = run_query(folder, name)
     except (UserError, duckdb.Error, OSError) as error:
         return {"reason": str(error)}
-    # Rows of ``soh`` for a type have no pack; the page shows only these rows.
+    # the page shows only the rows of ``soh`` that are for a type; these have no pack
     rows = [row for row in result.rows if name != "soh" or row[result.columns.index("pack")] is None]
     return {"columns": result.columns, "rows": rows[:MAX_ROWS], "count": len(rows), "notes": result.notes}

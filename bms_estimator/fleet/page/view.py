@@ -17,7 +17,7 @@ MAX_UNKNOWN = 1000
 
 
 class FleetView:
-    """State of packs and workers; times are monotonic [s].
+    """State of packs and workers; ``now_s`` is monotonic [s].
 
     Args:
         partitions: Number of partitions until the server reports it.
@@ -36,12 +36,12 @@ class FleetView:
         self.damaged = 0
         """Number of invalid heartbeats."""
 
-    def begin(self, now_s: float) -> None:
+    def set_connected(self, now_s: float) -> None:
         """Record that the connection is (re-)established."""
         self._since_s, self.listening = now_s, True
         self.workers.clear()
 
-    def end(self) -> None:
+    def set_disconnected(self) -> None:
         """Record that the connection is lost."""
         self.listening = False
 
@@ -54,7 +54,7 @@ class FleetView:
             self.damaged += 1
 
     def receive_unknown(self, name: str, reason: str) -> None:
-        """Record that a worker defers blocks of an unknown pack."""
+        """Store the reason why a worker defers the blocks of a pack."""
         self._unknown.pop(name, None)
         self._unknown[name] = reason
         if len(self._unknown) > MAX_UNKNOWN:
@@ -62,7 +62,7 @@ class FleetView:
 
     def set_pack_type(self, name: str, type_name: str | None) -> None:
         """Add a pack of the table, or change its type, such as "lfp 4s1p". None: the pack was removed from the table."""
-        self.packs.list_pack(name, type_name)
+        self.packs.set_type(name, type_name)
         if type_name is not None:
             self._unknown.pop(name, None)
 
@@ -100,7 +100,7 @@ class FleetView:
 
     def _unknown_packs(self, now_s: float) -> dict[str, Any]:
         """Return number, names and reasons of unknown packs. Reasons are deleted once no worker has an unknown pack."""
-        count, names = self.workers.unknown(now_s)
+        count, names = self.workers.unknown_packs(now_s)
         if not count:
             self._unknown.clear()
         newest = dict.fromkeys([*reversed(self._unknown), *names])

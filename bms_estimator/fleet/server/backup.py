@@ -3,10 +3,10 @@
 The server takes the snapshots of the streams one after another, while workers and edges continue. ``BACKUP_ORDER`` makes the
 snapshots consistent:
 
-- The pointers to the checkpoints come before the checkpoints, because a worker writes a checkpoint before the pointer to it. A
-  worker may remove a checkpoint during its snapshot after it has written two later ones. Then the first checkpoint of the day
-  remains, which the pointer also names.
-- ``RAW`` comes after the checkpoints, so that it has all messages that they include, and all later ones up to its snapshot.
+- The pointers to the checkpoints come before the checkpoints, because a worker writes a checkpoint before the pointer to it. If
+  a worker replaces the last two checkpoints of a pointer during the backup, the first checkpoint of the day remains, which the
+  pointer also names.
+- ``RAW`` comes after the checkpoints, so that it has the messages that follow each checkpoint.
   ``HOURS``, ``DEAD`` and ``HISTORY`` also come after the checkpoints, because a worker sends to them before it writes a
   checkpoint.
 - The table comes after ``RAW``, so that it has a row for each pack in ``RAW``. Rows come before the cell files that they name.
@@ -59,7 +59,7 @@ BACKUP_ORDER = (
 )
 """Names of the streams in a backup, in the order of their snapshots."""
 RESTORE_ORDER = (*(name for name in BACKUP_ORDER if name != subjects.RAW_STREAM), subjects.RAW_STREAM)
-"""Names of the streams in a backup, in the order of their restoration: a worker waits until ``RAW`` exists."""
+"""Names of the streams in the order of their restoration. ``RAW`` is the last one, because a worker waits until it exists."""
 
 
 async def back_up(nc: Client, folder: Path, include: list[Path], report: Callable[[str], None]) -> None:
@@ -112,7 +112,7 @@ async def restore(nc: Client, folder: Path, report: Callable[[str], None]) -> No
         StreamError: The server does not respond, or rejects a stream.
     """
     backup = read_list(folder)
-    configs = await _empty_streams(nc)
+    configs = await _configs_of_empty_streams(nc)
     _check_fit(backup, configs)
     try:
         await _delete_streams(nc)
@@ -134,7 +134,7 @@ async def _delete_streams(nc: Client) -> None:
             await js.delete_stream(name)
 
 
-async def _empty_streams(nc: Client) -> dict[str, dict[str, Any]]:
+async def _configs_of_empty_streams(nc: Client) -> dict[str, dict[str, Any]]:
     """Return the configurations of the streams, which have never had a message.
 
     Raises:
@@ -152,7 +152,7 @@ def _check_fit(backup: BackupList, configs: dict[str, dict[str, Any]]) -> None:
     """Check that the streams of a backup can be restored with the configurations of the new server.
 
     Raises:
-        UserError: A stream is missing; or they have another number of partitions, more replicas, or are larger.
+        UserError: A stream is missing, has another number of partitions or more replicas, or is too large.
     """
     if missing := set(BACKUP_ORDER) - backup.streams.keys():
         raise UserError(

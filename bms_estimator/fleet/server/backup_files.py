@@ -39,7 +39,7 @@ class BackupList(BaseModel):
 
     version: Literal[1] = 1
     made: str
-    """Begin of the backup (RFC 3339)."""
+    """Start time of the backup (RFC 3339)."""
     program: str
     """Version of the program that made the backup."""
     partitions: int
@@ -98,7 +98,7 @@ def copy_files(paths: list[Path], folder: Path) -> dict[str, FileDigest]:
     """Copy files and folders into the subfolder ``files`` of a backup, and return their digests.
 
     Raises:
-        UserError: A file cannot be read, or two have one name.
+        UserError: A file cannot be read, or two files have the same name.
     """
     digests = dict[str, FileDigest]()
     for path in paths:

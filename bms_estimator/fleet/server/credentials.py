@@ -19,7 +19,7 @@ from pathlib import Path
 
 from bms_estimator.fleet.server import jwt_claims
 from bms_estimator.fleet.server.disk_space import GB
-from bms_estimator.fleet.server.jwt_claims import ACCOUNT, BEARERS, OPERATOR, Key, Role, Tenant
+from bms_estimator.fleet.server.jwt_claims import ACCOUNT, BEARER_ROLES, OPERATOR, Key, Role, Tenant
 from bms_estimator.fleet.server.nats_config import Accounts
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
@@ -49,13 +49,16 @@ def make_accounts(folder: Path, tenants: Mapping[str, TenantSettings], now: date
     Raises:
         UserError: The folder cannot be read or written, or contains an invalid key.
     """
-    operator, system = _key(folder / "operator.nk", OPERATOR), _key(folder / "system.nk", ACCOUNT)
-    accounts = {system.public: jwt_claims.system_account(operator, system.public)}
+    operator, system = (
+        _read_or_create_key(folder / "operator.nk", OPERATOR),
+        _read_or_create_key(folder / "system.nk", ACCOUNT),
+    )
+    accounts = {system.public: jwt_claims.system_account_claims(operator, system.public)}
     for name, settings in sorted(tenants.items()):
         tenant = _tenant(folder / name, name, settings)
-        accounts[tenant.public] = jwt_claims.account(operator, tenant)
+        accounts[tenant.public] = jwt_claims.account_claims(operator, tenant)
         _write_users(folder / name, tenant.public, now)
-    claims = Accounts(jwt_claims.operator(operator, system.public), system.public, accounts)
+    claims = Accounts(jwt_claims.operator_claims(operator, system.public), system.public, accounts)
     write_file(folder / CLAIMS, json.dumps(vars(claims), indent=1).encode())
     return claims
 
@@ -94,7 +97,7 @@ def edge_tokens(
         hint = f"there are {', '.join(tenants)}" if tenants else "start `fleet serve` with it first"
         raise UserError(f"{folder}: no keys of a tenant {tenant}: {hint}")
     key, public = _read_key(signer), _read_key(account).public
-    return {pack: jwt_claims.user(key, public, Role.EDGE, pack, now, expires) for pack in packs}
+    return {pack: jwt_claims.user_token(key, public, Role.EDGE, pack, now, expires) for pack in packs}
 
 
 def write_tokens(path: Path, tokens: Mapping[str, str]) -> None:
@@ -113,18 +116,18 @@ def write_tokens(path: Path, tokens: Mapping[str, str]) -> None:
 
 def credentials_file(folder: Path, tenant: str, role: Role) -> Path:
     """Return the path of a role's credentials file, or token file for a role that connects by MQTT."""
-    return folder / tenant / f"{role.value}.{'token' if role in BEARERS else 'creds'}"
+    return folder / tenant / f"{role.value}.{'token' if role in BEARER_ROLES else 'creds'}"
 
 
 def _tenant(folder: Path, name: str, settings: TenantSettings) -> Tenant:
-    signers = {role: _key(folder / f"{role.value}.nk", ACCOUNT) for role in Role}
+    signers = {role: _read_or_create_key(folder / f"{role.value}.nk", ACCOUNT) for role in Role}
     revoked = {
         jwt_claims.user_key(signers[Role.EDGE], Role.EDGE, pack).public: int(before.timestamp())
         for pack, before in settings.revoked.items()
     }
     return Tenant(
         name=name,
-        public=_key(folder / "account.nk", ACCOUNT).public,
+        public=_read_or_create_key(folder / "account.nk", ACCOUNT).public,
         signers={role: key.public for role, key in signers.items()},
         disk_bytes=None if settings.disk_gb is None else round(GB * settings.disk_gb),
         revoked=revoked,
@@ -138,13 +141,13 @@ def _write_users(folder: Path, account: str, now: datetime) -> None:
         if role is Role.EDGE or path.exists():
             continue
         signer = _read_key(folder / f"{role.value}.nk")
-        token = jwt_claims.user(signer, account, role, role.value, now)
+        token = jwt_claims.user_token(signer, account, role, role.value, now)
         key = jwt_claims.user_key(signer, role, role.value)
-        write_file(path, token.encode() if role in BEARERS else jwt_claims.credentials(token, key))
+        write_file(path, token.encode() if role in BEARER_ROLES else jwt_claims.credentials(token, key))
 
 
-def _key(path: Path, prefix: int) -> Key:
-    """Read a key file; create it with a new key of ``prefix`` if it is missing."""
+def _read_or_create_key(path: Path, prefix: int) -> Key:
+    """Read a key file. If it is missing, create it with a new key of ``prefix``."""
     if not path.exists():
         write_file(path, jwt_claims.new_key(prefix).seed)
     return _read_key(path)
@@ -152,7 +155,7 @@ def _key(path: Path, prefix: int) -> Key:
 
 def _read_key(path: Path) -> Key:
     try:
-        return jwt_claims.key_of(_read(path, _MAX_KEY_BYTES).strip())
+        return jwt_claims.parse_key(_read(path, _MAX_KEY_BYTES).strip())
     except ValueError:
         raise UserError(f"{path}: not a key; put the right file back") from None
 

@@ -52,8 +52,8 @@ class Role(Enum):
     """Creates streams and writes the table of packs."""
 
 
-BEARERS = (Role.EDGE, Role.DASHBOARD, Role.MQTT_SENDER)
-"""Roles with bearer tokens. They connect by MQTT, which has no challenge that a key could sign."""
+BEARER_ROLES = (Role.EDGE, Role.DASHBOARD, Role.MQTT_SENDER)
+"""Roles with bearer tokens. They connect by MQTT, which has no challenge to sign."""
 
 _READER_PUBLISH = (
     "$JS.API.INFO",
@@ -126,14 +126,14 @@ class Key:
     """Key pair.
 
     Attributes:
-        seed: Private half; not part of ``repr``.
+        seed: Private key; not part of ``repr``.
     """
 
     seed: bytes
 
     @property
     def public(self) -> str:
-        """Public half, the identity of the owner."""
+        """Public key, which identifies the owner."""
         return str(nkeys.from_seed(self.seed).public_key.decode())
 
     def sign(self, data: bytes) -> bytes:
@@ -149,8 +149,8 @@ def new_key(prefix: int) -> Key:
     return Key(nkeys.encode_seed(os.urandom(32), prefix))
 
 
-def key_of(seed: bytes) -> Key:
-    """Return the key of a seed in its text form.
+def parse_key(seed: bytes) -> Key:
+    """Decode the text of a key file.
 
     Raises:
         ValueError: The seed is not a key.
@@ -168,7 +168,7 @@ def user_key(signer: Key, role: Role, name: str) -> Key:
     return Key(nkeys.encode_seed(hashlib.sha256(signer.seed + b"\0" + text).digest(), USER))
 
 
-def operator(key: Key, system: str) -> str:
+def operator_claims(key: Key, system: str) -> str:
     """Return the claims of the operator, which signs accounts.
 
     Args:
@@ -197,7 +197,7 @@ class Tenant:
     revoked: Mapping[str, int] | None = None
 
 
-def account(operator_key: Key, tenant: Tenant) -> str:
+def account_claims(operator_key: Key, tenant: Tenant) -> str:
     """Return the claims of a tenant's account. They depend only on the tenant, so that all nodes have equal claims."""
     disk = _UNLIMITED if tenant.disk_bytes is None else tenant.disk_bytes
     claims = {
@@ -216,13 +216,13 @@ def account(operator_key: Key, tenant: Tenant) -> str:
     return _signed(operator_key, tenant.public, tenant.name, claims)
 
 
-def system_account(operator_key: Key, public: str) -> str:
+def system_account_claims(operator_key: Key, public: str) -> str:
     """Return the claims of the account in which servers communicate; it has no users."""
     limits = _unlimited() | {"conn": _UNLIMITED}
     return _signed(operator_key, public, "system", {"limits": limits, "type": "account"})
 
 
-def user(
+def user_token(
     signer: Key, account_key: str, role: Role, name: str, issued: datetime, expires: datetime | None = None
 ) -> str:
     """Return the token of a user.
@@ -257,9 +257,9 @@ def _scope(role: Role, public: str) -> dict[str, Any]:
         "sub": _permission(subscribe, ()),
         **_unlimited(),
         **_LIMITS.get(role, {}),
-        "allowed_connection_types": ["MQTT"] if role in BEARERS else ["STANDARD"],
+        "allowed_connection_types": ["MQTT"] if role in BEARER_ROLES else ["STANDARD"],
     }
-    bearer = {"bearer_token": True} if role in BEARERS else {}
+    bearer = {"bearer_token": True} if role in BEARER_ROLES else {}
     return {"kind": "user_scope", "key": public, "role": role.value, "template": template | bearer}
 
 

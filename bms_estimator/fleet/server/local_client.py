@@ -28,9 +28,15 @@ async def connect(
     host, port = client_address(node.nats)
     url = f"{scheme(node)}://{f'[{host}]' if ':' in host else host}:{port}"
     tls = {"tls": _own_certificate(node.tls)} if node.tls else {}
-    users = {"user_credentials": credentials_file} if credentials_file else {}
+    credentials = {"user_credentials": credentials_file} if credentials_file else {}
     return await nats.connect(
-        url, allow_reconnect=False, connect_timeout=AUTH_TIMEOUT_S, closed_cb=on_close, error_cb=_ignore, **tls, **users
+        url,
+        allow_reconnect=False,
+        connect_timeout=AUTH_TIMEOUT_S,
+        closed_cb=on_close,
+        error_cb=_ignore,
+        **tls,
+        **credentials,
     )
 
 

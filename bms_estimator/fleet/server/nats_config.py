@@ -104,15 +104,15 @@ def configuration(node: Node) -> str:
     tls = _tls(node.tls) if node.tls else ""
     authorization = f"authorization {{ timeout: {AUTH_TIMEOUT_S} }}"
     lines = [
-        f"server_name: {_text(node.name)}",
-        f"listen: {_text(node.nats)}",
-        f"http: {_text(node.monitor)}",
+        f"server_name: {_quoted(node.name)}",
+        f"listen: {_quoted(node.nats)}",
+        f"http: {_quoted(node.monitor)}",
         f"max_payload: {MAX_PAYLOAD_BYTES}",
         f"max_connections: {MAX_CONNECTIONS}",
         *([tls] if tls else []),
         authorization,
         f"jetstream {{ {_jetstream(node)} }}",
-        f"mqtt {{ listen: {_text(node.mqtt)}, {authorization}{f', {tls}' if tls else ''} }}",
+        f"mqtt {{ listen: {_quoted(node.mqtt)}, {authorization}{f', {tls}' if tls else ''} }}",
         *_cluster(node),
         *_accounts(node),
     ]
@@ -123,15 +123,15 @@ def _jetstream(node: Node) -> str:
     limits = {"max_file_store": node.disk_bytes, "max_memory_store": node.memory_bytes}
     configured = [f"{name}: {value}" for name, value in limits.items() if value is not None]
     sync = "always" if node.sync_s is None else f'"{round(1000 * node.sync_s)}ms"'
-    return ", ".join([f"store_dir: {_text(str(node.store))}", *configured, f"sync_interval: {sync}"])
+    return ", ".join([f"store_dir: {_quoted(str(node.store))}", *configured, f"sync_interval: {sync}"])
 
 
 def _cluster(node: Node) -> list[str]:
     if node.cluster is None:
         return []
-    routes = ", ".join(_text(f"nats://{route}") for route in node.cluster.routes)
+    routes = ", ".join(_quoted(f"nats://{route}") for route in node.cluster.routes)
     tls = f", {_tls(node.tls, mutual=True)}" if node.tls else ""
-    return [f"cluster {{ name: fleet, listen: {_text(node.cluster.listen)}, routes: [{routes}]{tls} }}"]
+    return [f"cluster {{ name: fleet, listen: {_quoted(node.cluster.listen)}, routes: [{routes}]{tls} }}"]
 
 
 def _accounts(node: Node) -> list[str]:
@@ -152,10 +152,10 @@ def _accounts(node: Node) -> list[str]:
 def _tls(tls: Tls, *, mutual: bool = False) -> str:
     """Return the TLS block. With ``mutual`` the peer must present a certificate; clients present a token instead."""
     files = {"cert_file": tls.cert, "key_file": tls.key} | ({"ca_file": tls.ca} if tls.ca else {})
-    entries = ", ".join(f"{name}: {_text(str(path))}" for name, path in files.items())
+    entries = ", ".join(f"{name}: {_quoted(str(path))}" for name, path in files.items())
     return f"tls {{ {entries}, timeout: {AUTH_TIMEOUT_S}{', verify: true' if mutual else ''} }}"
 
 
-def _text(value: str) -> str:
+def _quoted(value: str) -> str:
     """Return a quoted string of the server's configuration language, which equals that of JSON."""
     return json.dumps(value, ensure_ascii=False)

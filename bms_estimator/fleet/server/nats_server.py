@@ -1,7 +1,7 @@
 """Supervisor of a nats-server as a child process: start, creation of streams, reload of settings, forwarding of signals.
 
 The child ends with this process, even if this process is killed. After a failure, systemd restarts both. Each connection of an
-edge needs an open file, whose limit is checked.
+edge is an open file, therefore a low limit of open files is logged.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from bms_estimator.fleet.server.local_client import scheme
 from bms_estimator.fleet.server.metrics_endpoint import metrics_endpoint
 from bms_estimator.fleet.server.monitor import POLL_S, is_healthy, query_monitor, wait_for_monitor
 from bms_estimator.fleet.server.nats_config import Node, configuration
-from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check_node_disk, check_tls_files, node_of
+from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check_node_disk, check_tls_files, node_config
 from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
 from bms_estimator.model.errors import UserError
@@ -61,19 +61,19 @@ gradually, so that they move to other nodes, and then ends."""
 HEALTH_S = 10.0
 """Poll interval for the health of the streams [s]."""
 MIN_FREE_FRACTION = 0.05
-"""Free fraction of the disk from which on a server is restarted whose disk was full, as in the alert ``FleetDiskFull``."""
+"""Minimum free fraction of a disk that was full, for the restart of the server. It is that of the alert ``FleetDiskFull``."""
 CONFIGURATION = "nats-server.conf"
 """Name of the server's configuration file."""
 
 
-async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Callable[[str], None]) -> int:
+async def serve(location: NodeLocation, read_spec: Callable[[], ServerSpec], report: Callable[[str], None]) -> int:
     """Run a node until it ends. SIGHUP reloads its settings: tenants, limits, revoked users.
 
-    nats-server stores nothing after its disk was full, and is restarted as soon as space is free.
+    After its disk was full, nats-server stores nothing until it is restarted. It is restarted as soon as space is free.
 
     Args:
-        place: Location of this node.
-        read: Reads the settings; called at start and at each SIGHUP.
+        location: Location of this node.
+        read_spec: Returns the settings; called at start and at each SIGHUP.
         report: Receives progress lines: addresses and created streams.
 
     Returns:
@@ -82,32 +82,32 @@ async def serve(place: NodeLocation, read: Callable[[], ServerSpec], report: Cal
     Raises:
         UserError: The server is missing or too old, settings are invalid, the disk is too small, or the server rejects the streams.
     """
-    while (code := await _serve_until_restart(place, read, report)) is None:
+    while (code := await _serve_until_restart(location, read_spec, report)) is None:
         log.warning("restarting nats-server, because the disk that was full has free space")
     return code
 
 
 async def _serve_until_restart(
-    place: NodeLocation, read: Callable[[], ServerSpec], report: Callable[[str], None]
+    location: NodeLocation, read_spec: Callable[[], ServerSpec], report: Callable[[str], None]
 ) -> int | None:
-    """Run a nats-server. Arguments, result and errors are those of ``serve``; None: the server must be restarted."""
-    binary, spec = find_server(), read()
-    place = replace(place, available_bytes=available_bytes(place.streams))
-    check_node_disk(place, spec)
+    """Run a nats-server. Arguments, result and errors are those of ``serve``; the result None requires a restart."""
+    binary, spec = find_server(), read_spec()
+    location = replace(location, available_bytes=available_bytes(location.streams))
+    check_node_disk(location, spec)
     warn_of_open_file_limit(spec.settings)
-    node = node_of(place, spec)
+    node = node_config(location, spec)
     if node.tls:
         check_tls_files(node.tls)
-    write_file(place.folder / CONFIGURATION, configuration(node).encode())
+    write_file(location.folder / CONFIGURATION, configuration(node).encode())
     async with (
-        NodeWatch(place) as watch,
+        NodeWatch(location) as watch,
         metrics_endpoint(spec.settings.server.metrics, node, watch),
-        _running(binary, place.folder / CONFIGURATION) as (process, end_requested),
+        _running(binary, location.folder / CONFIGURATION) as (process, end_requested),
     ):
         ended = asyncio.create_task(process.wait())
-        streams_ready = asyncio.create_task(_make_ready(place, spec, process.pid, report))
-        supervising = asyncio.create_task(_supervise(place, spec, read, process, streams_ready, report, watch))
-        needs_restart = asyncio.create_task(_until_disk_has_space_again(place, node))
+        streams_ready = asyncio.create_task(_make_ready(location, spec, process.pid, report))
+        supervising = asyncio.create_task(_supervise(location, spec, read_spec, process, streams_ready, report, watch))
+        needs_restart = asyncio.create_task(_until_disk_has_space_again(location, node))
         try:
             await asyncio.wait((ended, streams_ready), return_when=asyncio.FIRST_COMPLETED)
             if streams_ready.done() and not ended.done():
@@ -124,8 +124,8 @@ async def _serve_until_restart(
         return 0 if end_requested.is_set() else code
 
 
-async def _until_disk_has_space_again(place: NodeLocation, node: Node) -> None:
-    """Wait until a stream could not be written, because the disk was full, and space is free."""
+async def _until_disk_has_space_again(location: NodeLocation, node: Node) -> None:
+    """Wait until the server has reported a full disk, and the disk has free space."""
     last_error = ""
     while True:
         await asyncio.sleep(HEALTH_S)
@@ -134,15 +134,15 @@ async def _until_disk_has_space_again(place: NodeLocation, node: Node) -> None:
             continue
         if error != last_error:
             log.error("the disk is full: nothing is stored until space is free", reason=error)
-        last_error, disk = error, shutil.disk_usage(place.folder)
+        last_error, disk = error, shutil.disk_usage(location.folder)
         if disk.free > MIN_FREE_FRACTION * disk.total:
             return
 
 
 async def _supervise(
-    place: NodeLocation,
+    location: NodeLocation,
     spec: ServerSpec,
-    read: Callable[[], ServerSpec],
+    read_spec: Callable[[], ServerSpec],
     process: asyncio.subprocess.Process,
     streams_ready: asyncio.Task[None],
     report: Callable[[str], None],
@@ -157,15 +157,15 @@ async def _supervise(
         await requested.wait()
         requested.clear()
         try:
-            spec = read()
-            check_node_disk(place, spec)
-            node = node_of(place, spec)
+            spec = read_spec()
+            check_node_disk(location, spec)
+            node = node_config(location, spec)
             async with asyncio.timeout(RELOAD_TIMEOUT_S):
                 varz_before = await wait_for_monitor(node, "varz", bool)
-                write_file(place.folder / CONFIGURATION, configuration(node).encode())
+                write_file(location.folder / CONFIGURATION, configuration(node).encode())
                 process.send_signal(signal.SIGHUP)
                 await wait_for_monitor(node, "varz", functools.partial(_has_reloaded, varz_before))
-            await make_all_streams(place, spec, report)
+            await make_all_streams(location, spec, report)
             await watch.follow(spec)
         except (UserError, NatsError) as error:
             log.error("the settings were not changed", reason=str(error))  # noqa: TRY400 - a user error needs no traceback
@@ -202,14 +202,14 @@ async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subp
             loop.remove_signal_handler(number)
 
 
-async def _make_ready(place: NodeLocation, spec: ServerSpec, pid: int, report: Callable[[str], None]) -> None:
+async def _make_ready(location: NodeLocation, spec: ServerSpec, pid: int, report: Callable[[str], None]) -> None:
     """Wait for the server, report its addresses, wait for a quorum, and create the streams of all tenants.
 
     A response on the port could come from another server. Therefore the function waits for the file that this server
     writes as soon as it listens.
     """
-    node = node_of(place, spec)
-    while not list(place.folder.glob(f"*_{pid}.ports")):  # noqa: ASYNC110 - the server has no other signal
+    node = node_config(location, spec)
+    while not list(location.folder.glob(f"*_{pid}.ports")):  # noqa: ASYNC110 - the server has no other signal
         await asyncio.sleep(POLL_S)
     secure = "s" if node.tls else ""
     report(f"edges: mqtt{secure}://{node.mqtt}  workers: {scheme(node)}://{node.nats}  monitor: http://{node.monitor}")
@@ -218,7 +218,7 @@ async def _make_ready(place: NodeLocation, spec: ServerSpec, pid: int, report: C
     await wait_for_monitor(node, "healthz", is_healthy)
     while True:
         try:
-            return await make_all_streams(place, spec, report)
+            return await make_all_streams(location, spec, report)
         except NoAnswerError as error:  # the node is busy with reconnecting clients, or the cluster has no quorum
             log.warning("the streams cannot be created yet; trying again", reason=str(error))
 

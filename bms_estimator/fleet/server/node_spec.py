@@ -1,4 +1,4 @@
-"""Place and settings of a node of the server, and the configuration that follows from them."""
+"""Location and settings of a node of the server, and the configuration that follows from them."""
 
 import ssl
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ MAX_REPLICAS = 3
 
 @dataclass(frozen=True)
 class NodeLocation:
-    """Place of a node in the cluster, and its folder.
+    """Number of a node in the cluster, and its folder.
 
     Attributes:
         folder: Folder of streams and keys.
@@ -60,30 +60,30 @@ class ServerSpec:
     accounts: Accounts | None = None
 
 
-def node_of(place: NodeLocation, spec: ServerSpec) -> Node:
+def node_config(location: NodeLocation, spec: ServerSpec) -> Node:
     """Return the node's configuration."""
     server, tls = spec.settings.server, spec.settings.tls
-    own_address = place.nodes[place.number - 1] if place.nodes else ""
+    own_address = location.nodes[location.number - 1] if location.nodes else ""
     return Node(
-        name=f"n{place.number}",
-        store=place.streams,
+        name=f"n{location.number}",
+        store=location.streams,
         nats=server.listen,
         mqtt=server.mqtt,
         monitor=server.monitor,
-        cluster=Cluster(_listen_address(own_address), place.nodes) if place.nodes else None,
+        cluster=Cluster(_listen_address(own_address), location.nodes) if location.nodes else None,
         tls=_tls(tls) if tls else None,
         accounts=spec.accounts,
         partitions=server.partitions,
-        disk_bytes=_disk_bytes(place, server.disk_gb),
+        disk_bytes=_disk_bytes(location, server.disk_gb),
         sync_s=server.sync_s or None,
     )
 
 
-def _disk_bytes(place: NodeLocation, disk_gb: float | None) -> int | None:
+def _disk_bytes(location: NodeLocation, disk_gb: float | None) -> int | None:
     """Return the limit of the size of all streams [bytes]; None before the start, unless it is configured."""
     if disk_gb is not None:
         return round(GB * disk_gb)
-    return None if place.available_bytes is None else round(USABLE_FRACTION * place.available_bytes)
+    return None if location.available_bytes is None else round(USABLE_FRACTION * location.available_bytes)
 
 
 def _tls(settings: TlsSettings) -> Tls:
@@ -95,7 +95,7 @@ def _tls(settings: TlsSettings) -> Tls:
 
 
 def check_tls_files(tls: Tls) -> None:
-    """Check the TLS files before the server does, because its error has the wrong exit code.
+    """Check the TLS files before nats-server does, whose exit code would not report a wrong setting.
 
     Raises:
         UserError: A file cannot be read, or the key does not belong to the certificate.
@@ -112,14 +112,14 @@ def check_tls_files(tls: Tls) -> None:
         raise UserError(f"tls.cert_file = {tls.cert}, tls.key_file = {tls.key}: {error.reason or error}") from None
 
 
-def check_node_disk(place: NodeLocation, spec: ServerSpec) -> None:
+def check_node_disk(location: NodeLocation, spec: ServerSpec) -> None:
     """Check that the streams of all tenants fit (``disk_space.check_disk_space``).
 
     Raises:
         UserError: They do not fit.
     """
-    copies_per_node = place.replicas / (len(place.nodes) or 1)
-    check_disk_space(spec.settings, place.streams, place.available_bytes or 0, copies_per_node)
+    copies_per_node = location.replicas / (len(location.nodes) or 1)
+    check_disk_space(spec.settings, location.streams, location.available_bytes or 0, copies_per_node)
 
 
 def _listen_address(cluster_address: str) -> str:

@@ -9,7 +9,7 @@ from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.monitor import is_healthy, query_monitor
 from bms_estimator.fleet.server.nats_config import Node
-from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_of
+from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_config
 from bms_estimator.fleet.server.tenant_streams import makes_streams
 from bms_estimator.fleet.server.tenant_watch import TenantWatch
 from bms_estimator.process.tasks import end
@@ -19,11 +19,11 @@ class NodeWatch:
     """Watch that lasts as long as the context.
 
     Args:
-        place: Location of the node.
+        location: Location of the node.
     """
 
-    def __init__(self, place: NodeLocation) -> None:
-        self._place = place
+    def __init__(self, location: NodeLocation) -> None:
+        self._location = location
         self._tenants: dict[str, TenantWatch] = {}
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -36,8 +36,8 @@ class NodeWatch:
     async def follow(self, spec: ServerSpec) -> None:
         """Watch the tenants of these settings instead of the former ones."""
         await end(*self._tasks)
-        node, keys = node_of(self._place, spec), self._place.keys
-        names = spec.settings.tenants_or_default if makes_streams(self._place, node) else ()
+        node, keys = node_config(self._location, spec), self._location.keys
+        names = spec.settings.tenants_or_default if makes_streams(self._location, node) else ()
         self._tenants = {
             name: TenantWatch(name, node, credentials.credentials_file(keys, name, Role.READER) if name else None)
             for name in names
@@ -47,7 +47,7 @@ class NodeWatch:
     async def node_state(self, node: Node) -> NodeState:
         """Return the present state of the node."""
         health, varz = await asyncio.gather(query_monitor(node, "healthz"), query_monitor(node, "varz"))
-        disk = shutil.disk_usage(self._place.folder)
+        disk = shutil.disk_usage(self._location.folder)
         return NodeState(is_healthy(health), varz, disk.total, disk.free)
 
     async def tenant_states(self) -> dict[str, TenantState]:

@@ -11,32 +11,32 @@ from bms_estimator.fleet.server.disk_space import sizes_of
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.local_client import connect
 from bms_estimator.fleet.server.nats_config import Node
-from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_of
+from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_config
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.settings.fleet import TenantSettings
 
 
-async def make_all_streams(place: NodeLocation, spec: ServerSpec, report: Callable[[str], None]) -> None:
-    """Create the streams of all tenants, on the node that does this."""
-    node = node_of(place, spec)
-    if not makes_streams(place, node):
+async def make_all_streams(location: NodeLocation, spec: ServerSpec, report: Callable[[str], None]) -> None:
+    """Create the streams of all tenants, if ``makes_streams`` is true for this node."""
+    node = node_config(location, spec)
+    if not makes_streams(location, node):
         report("ready; streams are made by the node that has the keys, the first")
         return
     for name, tenant in spec.settings.tenants_or_default.items():
-        await _make_streams(place, spec, name, tenant)
-        keys = f"; its keys: {place.keys / name}" if name else ""
+        await _make_streams(location, spec, name, tenant)
+        keys = f"; its keys: {location.keys / name}" if name else ""
         report(f"{f'tenant {name}: ' if name else ''}streams ready, {node.partitions} partitions{keys}")
 
 
-def makes_streams(place: NodeLocation, node: Node) -> bool:
+def makes_streams(location: NodeLocation, node: Node) -> bool:
     """Return True if this node creates the streams: the node with the keys; without accounts, the first node."""
-    return place.number == 1 if node.accounts is None else credentials.has_keys(place.keys)
+    return location.number == 1 if node.accounts is None else credentials.has_keys(location.keys)
 
 
-async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant: TenantSettings) -> None:
-    node, server, sizes = node_of(place, spec), spec.settings.server, sizes_of(spec.settings, tenant)
+async def _make_streams(location: NodeLocation, spec: ServerSpec, name: str, tenant: TenantSettings) -> None:
+    node, server, sizes = node_config(location, spec), spec.settings.server, sizes_of(spec.settings, tenant)
     try:
-        nc = await connect(node, credentials.credentials_file(place.keys, name, Role.ADMIN) if name else None)
+        nc = await connect(node, credentials.credentials_file(location.keys, name, Role.ADMIN) if name else None)
     except TimeoutError:
         raise NoAnswerError(f"{node.nats}: the server does not accept the connection in time") from None
     except (NatsError, OSError) as error:
@@ -45,7 +45,7 @@ async def _make_streams(place: NodeLocation, spec: ServerSpec, name: str, tenant
         await make_streams(
             nc,
             partitions=node.partitions,
-            replicas=place.replicas,
+            replicas=location.replicas,
             raw_bytes=sizes.raw,
             raw_age_s=86_400.0 * (tenant.outage_days or server.outage_days),
             states_bytes=sizes.states,

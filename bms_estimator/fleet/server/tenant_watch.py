@@ -1,7 +1,4 @@
-"""Watch over one tenant: heartbeats of its workers, its streams, undelivered messages, unsaved blocks, and silent packs and alarms.
-
-A worker publishes the summary of an hour when the pack's next hour begins.
-"""
+"""Watch over one tenant: heartbeats of its workers, its streams, undelivered messages, unsaved blocks, silent packs and alarms."""
 
 import asyncio
 import contextlib
@@ -29,17 +26,15 @@ from bms_estimator.fleet.server.local_client import connect
 from bms_estimator.fleet.server.nats_config import Node
 
 SILENT_S = 3.0 * 3600.0
-"""Time without a summary after which a pack counts as silent [s], about that of the query ``silent``."""
-
-
-ALARMS = re.compile(rb'"alarms":"[^"]*(weak_cell|cell_short)')
-"""Part of a summary with an alarm of a faulty cell. Other alarms are also raised in healthy packs."""
+"""Time without an hourly summary after which a pack counts as silent [s]. A summary arrives when the next hour begins."""
+FAULTY_CELL_ALARM = re.compile(rb'"alarms":"[^"]*(weak_cell|cell_short)')
+"""Pattern in a summary with an alarm of a faulty cell. Healthy packs can raise all other alarms."""
 
 
 class ArrivalWatch:
     """Watch over the arrival of summaries; times are of one monotonic clock [s].
 
-    A pack without a summary counts from the start of the watch, or from its addition to the table.
+    The silence of a pack without a summary counts from the start of the watch, or from its addition to the table.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -76,7 +71,9 @@ class ArrivalWatch:
                 pack = message.subject.rpartition(".")[2]
                 if pack in self._last_s:
                     self._last_s[pack] = now_s
-                    (self._with_alarms.add if ALARMS.search(message.data) else self._with_alarms.discard)(pack)
+                    (self._with_alarms.add if FAULTY_CELL_ALARM.search(message.data) else self._with_alarms.discard)(
+                        pack
+                    )
             self._next_sequence = batch[-1].sequence + 1
         return Problems(sum(now_s - last_s > SILENT_S for last_s in self._last_s.values()), len(self._with_alarms))
 
@@ -91,8 +88,8 @@ async def undelivered_messages(nc: Client, partitions: int) -> dict[int, int]:
     consumers = dict[str, ConsumerInfo]()
     while page := await js.consumers_info(subjects.RAW_STREAM, offset=len(consumers)):
         consumers |= {info.name: info for info in page}
-    named = {number: consumers.get(consumer(number)) for number in range(partitions)}
-    return {number: info.num_pending or 0 for number, info in named.items() if info}
+    by_partition = {number: consumers.get(consumer(number)) for number in range(partitions)}
+    return {number: info.num_pending or 0 for number, info in by_partition.items() if info}
 
 
 CHECK_S = 60.0
@@ -193,5 +190,5 @@ class TenantWatch:
                     await closed.wait()
 
     async def _receive(self, message: Msg) -> None:
-        with contextlib.suppress(ValidationError):  # of another version; `fleet status` reports it
+        with contextlib.suppress(ValidationError):  # heartbeat of another version; `fleet status` reports it
             self._workers.receive(Heartbeat.model_validate_json(message.data), time.monotonic())

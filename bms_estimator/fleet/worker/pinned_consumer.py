@@ -20,7 +20,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import is_fit
 from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError
-from bms_estimator.fleet.nats.streams import GROUP, PIN_S, RESPONSE_TIMEOUT_S, consumer
+from bms_estimator.fleet.nats.streams import PIN_S, PRIORITY_GROUP, RESPONSE_TIMEOUT_S, consumer
 from bms_estimator.fleet.packs.table_change import is_change
 
 
@@ -202,10 +202,10 @@ class PinnedConsumer:
         pin, self._pin = self._pin, ""
         self.waiting.clear()
         if pin:
-            await self._nc.request(self._unpin_subject, json.dumps({"group": GROUP}).encode(), timeout=PIN_S)
+            await self._nc.request(self._unpin_subject, json.dumps({"group": PRIORITY_GROUP}).encode(), timeout=PIN_S)
 
     async def _request(self, batch: int) -> None:
-        request: dict[str, str | int] = {"batch": batch, "expires": round(1e9 * EXPIRES_S), "group": GROUP}
+        request: dict[str, str | int] = {"batch": batch, "expires": round(1e9 * EXPIRES_S), "group": PRIORITY_GROUP}
         if self._pin:
             request["id"] = self._pin
         self._taken_since_request = 0

@@ -41,7 +41,7 @@ in_module = pytest.mark.asyncio(loop_scope="module")
 module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 
 PARTITIONS = 8
-STEP_S = 0.05
+OVERVIEW_S = 0.05
 """Update interval of the page [s]."""
 MAX_BYTES = 60_000
 """Maximum total size of the served files [bytes]."""
@@ -104,10 +104,10 @@ async def fleet(cluster: NatsCluster, hours: Path) -> AsyncIterator[Fleet]:
     await load(nc, [*PACKS, LISTED_ONLY])
     await store_dead_letter(nc, "home-1")
     settings = PageSettings(listen="127.0.0.1:0")
-    async with fleet_page(Server(cluster.url), settings, hours, step_s=STEP_S) as url:
+    async with fleet_page(Server(cluster.url), settings, hours, overview_s=OVERVIEW_S) as url:
         publisher_task = asyncio.create_task(work(nc))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(packs, "ALIVE_S", math.inf)  # van-2 has no state, but must not become silent
+            patch.setattr(packs, "SILENT_S", math.inf)  # van-2 has no state, but must not become silent
             yield Fleet(cluster, nc, url)
         publisher_task.cancel()
         await asyncio.gather(publisher_task, return_exceptions=True)
@@ -201,7 +201,7 @@ async def test_packs_with_concerns_are_ranked_and_names_are_escaped(browser: Bro
             async with asyncio.timeout(LONG_S):
                 while rows != expected:
                     rows = [" ".join(text.split()) for text in await page.locator("#concerns tr").all_inner_texts()]
-                    await asyncio.sleep(STEP_S)
+                    await asyncio.sleep(OVERVIEW_S)
         assert rows == expected
         assert await page.locator("#concerns img").count() == 0
         await page.locator("[data-count=soc]").click()

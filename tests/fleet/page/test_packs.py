@@ -8,7 +8,7 @@ from bms_estimator.fleet.fleet_workers import FleetWorkers
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.nats.dead_packs import DeadPacks
 from bms_estimator.fleet.page.nats_feed import type_name
-from bms_estimator.fleet.page.packs import ALIVE_S, MAX_LISTED, OTHER, UNLISTED, FleetPacks
+from bms_estimator.fleet.page.packs import MAX_LISTED, OTHER, SILENT_S, UNLISTED, FleetPacks
 from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.model.input_faults import InputFault
 from tests.fleet.published_states import HOME, make_packs, state
@@ -25,16 +25,16 @@ def receive_states(states: dict[str, bytes], now_s: float = 0.0) -> FleetPacks:
     """Return packs of one type that are in the table of packs and have published these states."""
     packs = FleetPacks()
     for name, data in states.items():
-        packs.list_pack(name, "lfp 16s1p")
+        packs.set_type(name, "lfp 16s1p")
         packs.receive_state(name, data, now_s)
     return packs
 
 
 def test_pack_without_a_state_or_with_none_for_three_minutes_is_silent():
     packs = receive_states({"a": healthy(), "b": healthy()})
-    packs.list_pack("c", "lfp 16s1p")
+    packs.set_type("c", "lfp 16s1p")
     packs.receive_state("b", healthy(), 100.0)
-    overview = packs.overview(100.0 + ALIVE_S - 1.0, 0.0)
+    overview = packs.overview(100.0 + SILENT_S - 1.0, 0.0)
     assert overview["packs"] == {"known": 3, "alive": 1, "silent": 2, "unlisted": 0, "uncertain": 0}
     assert overview["concerns"]["silent"]["packs"] == [["c", None], ["a", 279.0]]
     assert overview["attention_count"] == 2
@@ -42,7 +42,7 @@ def test_pack_without_a_state_or_with_none_for_three_minutes_is_silent():
 
 def test_pack_is_not_silent_within_three_minutes_after_the_start_of_the_page():
     packs = receive_states({"a": healthy()})
-    overview = packs.overview(1000.0, 1000.0 - ALIVE_S)
+    overview = packs.overview(1000.0, 1000.0 - SILENT_S)
     assert (overview["packs"]["alive"], overview["packs"]["silent"], overview["attention_count"]) == (0, 0, 0)
 
 
@@ -51,8 +51,8 @@ def test_pack_outside_the_table_counts_after_its_first_state_and_a_removed_pack_
     packs.receive_parameters("guest", b"{}")
     assert packs.overview(1.0, 0.0)["packs"]["known"] == 0
     packs.receive_state("guest", healthy(), 1.0)
-    packs.list_pack("a", "lfp 16s1p")
-    packs.list_pack("a", None)
+    packs.set_type("a", "lfp 16s1p")
+    packs.set_type("a", None)
     overview = packs.overview(1.0, 0.0)
     assert overview["packs"] == {"known": 1, "alive": 1, "silent": 0, "unlisted": 1, "uncertain": 0}
     assert [t["type"] for t in overview["types"]] == [UNLISTED]
@@ -77,7 +77,7 @@ def test_soc_and_its_std_are_counted_in_bins_for_each_type():
 def test_types_beyond_the_eight_most_frequent_are_combined():
     packs = FleetPacks()
     for number in range(12):
-        packs.list_pack(f"p{number}", f"type {number}")
+        packs.set_type(f"p{number}", f"type {number}")
     types = packs.overview(0.0, 0.0)["types"]
     assert (len(types), types[-1]["type"], types[-1]["packs"]) == (9, OTHER, 4)
 
@@ -127,7 +127,7 @@ def test_only_the_packs_with_the_lowest_soc_are_listed():
 
 def test_packs_are_found_by_prefix():
     packs = receive_states({f"van-{n:03d}": healthy() for n in range(100)})
-    packs.list_pack("attic", "lfp 16s1p")
+    packs.set_type("attic", "lfp 16s1p")
     assert packs.find("van-01") == [f"van-{n:03d}" for n in range(10, 20)]
     assert packs.find("att") == ["attic"]
     assert packs.find("x") == []
@@ -260,7 +260,7 @@ def test_new_connection_clears_workers_but_not_packs():
     view = FleetView(1, 0.0)
     view.receive_worker(heartbeat("w", 0).model_dump_json().encode(), 0.0)
     view.packs.receive_state("a", healthy(), 0.0)
-    view.begin(1000.0)
+    view.set_connected(1000.0)
     overview = view.overview(1001.0, 0.0)
     assert overview["workers"] == []
     assert overview["packs"] == {"known": 1, "alive": 0, "silent": 0, "unlisted": 1, "uncertain": 0}

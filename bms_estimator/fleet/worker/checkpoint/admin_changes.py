@@ -22,7 +22,7 @@ from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, Checkpoi
 from bms_estimator.fleet.nats.connection import RETRY_S
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.fleet.nats.streams import GROUP, RESPONSE_TIMEOUT_S, consumer, require_partitions
+from bms_estimator.fleet.nats.streams import PRIORITY_GROUP, RESPONSE_TIMEOUT_S, consumer, require_partitions
 from bms_estimator.fleet.packs.pack_bucket import POLL_S, purge_keys, read_bucket, remove_keys
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
@@ -69,7 +69,7 @@ async def change_checkpoints(nc: Client, partition: int, change: Callable[[], Aw
     # a worker whose pin ends checks its claim, finds it replaced, and drops the partition from its memory
     request = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
     with suppress(nats.errors.TimeoutError):
-        await nc.request(request, json.dumps({"group": GROUP}).encode(), timeout=RESPONSE_TIMEOUT_S)
+        await nc.request(request, json.dumps({"group": PRIORITY_GROUP}).encode(), timeout=RESPONSE_TIMEOUT_S)
 
 
 def day_of(info: CheckpointInfo) -> date:
