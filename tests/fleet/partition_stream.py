@@ -54,16 +54,16 @@ class Stream:
         self.messages.append((pack, data))
         if defer:
             return self.partition.defer(pack, len(self.messages))
-        return self.partition.take(pack, data, len(self.messages))
+        return self.partition.process(pack, data, len(self.messages))
 
-    def take_deferred(self, max_messages: int = 10_000) -> list[BlockResult]:
+    def process_deferred(self, max_messages: int = 10_000) -> list[BlockResult]:
         """Process deferred messages of known packs, one message of each pack in turn."""
         results: list[BlockResult] = []
         while len(results) < max_messages and (entry := self.partition.deferred.next(self.partition.in_force.is_known)):
             pack, span = entry
             messages = enumerate(self.messages, 1)
             data, sequence = next((data, n) for n, (sender, data) in messages if sender == pack and n >= span.first)
-            results.append(self.partition.take_deferred(pack, data, sequence))
+            results.append(self.partition.process_deferred(pack, data, sequence))
         return results
 
     def save(self, *, is_whole: bool = True) -> None:

@@ -24,5 +24,5 @@ def test_edited_batches_are_rejected_with_a_reason_or_become_blocks(data: bytes)
     blocks = OpenBlocks(60.0)
     blocks.set_position("p", NO_POSITION)
     selection = blocks.add("p", batch, ARRIVAL_S, 0.0, 1)
-    blocks.cut()
+    blocks.complete()
     assert sum(decode(block.data).samples.size for block in blocks.completed) == selection.samples.size

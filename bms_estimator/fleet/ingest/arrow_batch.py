@@ -16,7 +16,7 @@ from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, V
 _HEADER, _LENGTH, _NODES, _COMPRESSION = 2, 0, 1, 3
 """Indices of fields: ``header`` of the table ``Message``; ``length``, ``nodes``, ``compression`` of the table ``RecordBatch``."""
 _NODE = struct.Struct("<qq")
-"""Layout of a node: number of values of a column or of its lists, and number of missing values."""
+"""Layout of a ``FieldNode``: number of values of a column, or of all its lists, and number of nulls."""
 
 
 def decode_arrow(payload: bytes) -> BatchColumns:

@@ -59,9 +59,7 @@ def parquet_files(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_history(files: Sequence[Path], reader: BatchReader, folder: Path) -> Generator[PackBatch, None, None]:
-    """Yield the samples of all packs day by day, and within a day pack by pack.
-
-    Therefore all packs advance together, and several workers are busy.
+    """Yield the samples of all packs day by day, and within a day pack by pack, so that several workers are busy.
 
     Args:
         files: The Parquet files.
@@ -127,17 +125,17 @@ def _database(folder: Path) -> Iterator[duckdb.DuckDBPyConnection]:
             raise UserError(f"--parquet: {error}") from None
 
 
-PART_SAMPLES = 4096
-"""Maximum number of samples that are added at a time, and therefore of blocks."""
+MAX_PART_SAMPLES = 4096
+"""Maximum number of samples that are added at a time. They make at most as many blocks."""
 MAX_UNCONFIRMED_OF_PACK = 5000
-"""Number of unconfirmed blocks of a pack at which the backfill waits. ``PART_SAMPLES`` more blocks may follow. The sum is below
-``store_table.MAX_PACK_BLOCKS``, so that none is dropped."""
+"""Number of unconfirmed blocks of a pack at which the backfill waits. ``MAX_PART_SAMPLES`` more blocks may follow. The sum is below
+``store_table.MAX_PACK_BLOCKS``, so that no block is dropped."""
 MAX_UNCONFIRMED = 1_000_000
 """Number of unconfirmed blocks of all packs at which the backfill waits: 0.6 GB of minute blocks at 1 Hz."""
 SAVE_SAMPLES = 10_000
-"""Number of samples after which they are written to disk."""
+"""Number of added samples after which the blocks are written to disk."""
 WAIT_S = 0.5
-"""Interval between two checks whether workers have confirmed blocks [s]."""
+"""Poll interval for confirmations of workers [s]."""
 REQUEST_S = 10.0
 """Interval between two requests of a confirmation [s]. Workers confirm blocks after their next checkpoint."""
 PROGRESS_S = 10.0
@@ -159,12 +157,12 @@ async def backfill(options: Options, paths: list[Path], stop: asyncio.Event) -> 
             return "stopped before the server responded"
         _, store, bucket = started
         history = read_history(files, reader, options.folder)
-        run = Backfill(store, bucket, stop)
+        sender = Backfill(store, bucket, stop)
         try:
-            await run.send(history)
+            await sender.send(history)
         finally:
             history.close()
-        return run.summary
+        return sender.summary
 
 
 class Backfill:
@@ -204,13 +202,13 @@ class Backfill:
                 continue
             if pack not in self._store:
                 await self._add_pack(pack)
-            for first in range(0, batch.samples.size, PART_SAMPLES):
+            for first in range(0, batch.samples.size, MAX_PART_SAMPLES):
                 await self._wait_for_confirmations(pack)
                 if self._stop.is_set():
                     break
-                part = slice(first, first + PART_SAMPLES)
+                part = slice(first, first + MAX_PART_SAMPLES)
                 await self._add(pack, BatchSamples(batch.samples[part], batch.cells_v[part]))
-        self._store.cut()
+        self._store.complete()
         await self._save()
         if self._stop.is_set():
             await self._store.send_remaining()
@@ -228,7 +226,9 @@ class Backfill:
                 return
 
     async def _add(self, pack: str, batch: BatchSamples) -> None:
-        sequence = self._store.progress.sequence + 1  # leaves the progress in the stream of batches unchanged
+        sequence = (
+            self._store.progress.sequence + 1
+        )  # a value with which ``save`` leaves the progress in ``TELEMETRY`` unchanged
         selection = self._store.add(pack, batch, time.time(), sequence)
         self._counters["samples"] += selection.samples.size
         self._counters["old"] += selection.old

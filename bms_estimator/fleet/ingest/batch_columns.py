@@ -6,7 +6,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 Values = Sequence[Any] | NDArray[Any]
-"""Values of a column: numbers, texts, or ``datetime64`` of a column of timestamps; one list for each row of cell voltages."""
+"""Values of a column: numbers, texts, ``datetime64`` timestamps, or one list of cell voltages for each row."""
 BatchColumns = Mapping[str, Values]
 """Columns of equal length by name."""
 

@@ -19,7 +19,7 @@ from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 LOG_INTERVAL_S = 60.0
 """Minimum interval between two log lines about a pack [s]."""
 MAX_LOGGED_PACKS = 10_000
-"""Maximum number of packs whose last log line is remembered, and of unknown packs that are counted."""
+"""Maximum number of packs whose last log time is stored, and of unknown packs that are counted."""
 SHOWN_PACKS = 10
 """Maximum number of unknown packs that a log line names."""
 ATTEMPTS = 5
@@ -27,7 +27,7 @@ ATTEMPTS = 5
 RETRY_S = 1.0
 """Retry interval [s]."""
 WORKER = "ingest"
-"""Name by which dead letters of batches are recognized."""
+"""Value of ``DeadLetter.worker`` for rejected batches."""
 
 log = structlog.get_logger(__name__)
 
@@ -39,13 +39,13 @@ class BatchReport(BaseModel):
 
     pack: str
     sequence: int
-    """Sequence number of the batch in the stream ``TELEMETRY``, which the server has also acknowledged to the sender."""
+    """Sequence number of the batch in the stream ``TELEMETRY``. The server's acknowledgment to the sender has it, too."""
     stored: int
     """Number of samples that were stored."""
     dropped: int
     """Number of samples that were dropped."""
     error: str
-    """Reason, and what to do."""
+    """Reason and remedy."""
 
 
 class BatchReports:
@@ -55,7 +55,7 @@ class BatchReports:
         nc: Connection to the tenant's NATS account.
 
     Attributes:
-        counters: Numbers of batches and samples by their fate.
+        counters: Numbers of batches and samples by outcome.
     """
 
     def __init__(self, nc: Client) -> None:
@@ -72,7 +72,7 @@ class BatchReports:
         await self._store(letter)
 
     async def reject_unknown(self, message: StoredMessage, pack: str) -> None:
-        """Report a batch of a pack that is not in the table of packs. ``log_unknown`` logs it."""
+        """Publish a report of a batch whose pack is not in the table of packs. ``log_unknown`` logs it later."""
         self.counters["rejected_batches"] += 1
         self._unknown_batches += 1
         if len(self._unknown) < MAX_LOGGED_PACKS:

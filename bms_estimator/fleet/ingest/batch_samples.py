@@ -39,11 +39,11 @@ MIN_TIME_S = 946_684_800.0
 MAX_LAYOUTS = 256
 """Maximum number of headers whose layout is cached."""
 MAX_COLUMNS = 4096
-"""Maximum number of columns. Their recognition takes 70 ms, in which other tasks wait."""
+"""Maximum number of columns. Other tasks wait while columns are recognized, 70 ms for this number."""
 MAX_CACHED_COLUMNS, MAX_CACHED_CHARACTERS = 400, 8000
 """Maximum size of a header whose layout is cached. With ``MAX_LAYOUTS`` headers of this size the cache has about 16 MB."""
 CELLS = "cells"
-"""Name of the column with a list of cell voltages in each row, without its unit. Instead, each cell may have a column
+"""Name, without its unit, of the column with a list of cell voltages in each row. Alternatively, each cell has a column
 ``cell_1_v``, ``cell_2_v`` and so on."""
 _TABLE_NAME = "the batch"
 """Name of a batch in the errors of ``LayoutFinder``; removed from them."""
@@ -74,7 +74,7 @@ class BatchReader:
 
     Args:
         column_map: Configured names of columns; None: the columns are recognized.
-        current_sign: Direction of positive current in the batches; None: that of a recognized format, otherwise positive on
+        current_sign: Direction of positive current in the batches; None: that of a recognized format, or else positive on
             discharge.
     """
 
@@ -197,7 +197,7 @@ def drop_reason(old: int, implausible: int, last_s: float) -> str:
 
 
 def split_by_time(batch: BatchSamples, max_samples: int) -> Iterator[BatchSamples]:
-    """Yield the samples of a batch in parts of at most ``max_samples``. Several parts are in order of time."""
+    """Yield the samples of a batch in parts of at most ``max_samples``, in order of time if there are several."""
     if batch.samples.size <= max_samples:
         yield batch
         return

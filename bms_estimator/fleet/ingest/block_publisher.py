@@ -35,7 +35,7 @@ class BlockPublisher:
     Attributes:
         sent: Id of the last acknowledged block. The caller sets it to 0 to send all blocks again.
         published: Number of acknowledged blocks since the start, with repetitions.
-        resends: Number of requests of workers to send blocks again.
+        resends: Number of accepted requests to send blocks again.
         idle: Set while the server has acknowledged all blocks in the database.
     """
 
@@ -50,12 +50,12 @@ class BlockPublisher:
         self._trouble = ""
 
     def notify(self) -> None:
-        """Announce new blocks in the database."""
+        """Wake up ``run`` after a change of the database."""
         self.idle.clear()
         self._stored.set()
 
-    def resend(self, pack: str, number: int) -> None:
-        """Send a block and all later blocks of a pack again, unless this happened less than ``RESEND_S`` ago."""
+    def request_resend(self, pack: str, number: int) -> None:
+        """Let ``run`` send a block and all later blocks of a pack again, unless it was requested less than ``RESEND_S`` ago."""
         now_s = asyncio.get_running_loop().time()
         last_number, last_s = self._last_resend.get(pack, (0, -math.inf))
         if number == last_number and now_s - last_s < RESEND_S:
@@ -65,8 +65,8 @@ class BlockPublisher:
         self.resends += 1
         self.notify()
 
-    async def send_again(self, pack: str, number: int) -> None:
-        """Send one block of a pack again, to which a worker replies. Errors are ignored, because the caller repeats the call."""
+    async def send_one_again(self, pack: str, number: int) -> None:
+        """Send one block of a pack again at once. Errors are ignored, because the caller repeats the call."""
         with contextlib.suppress(*RETRYABLE_ERRORS, StoreError):
             page = await self._database.call(BlockPage(1, pack=pack, first=number))
             await self._publish([block for block in page if block.id <= self.sent])
@@ -92,7 +92,7 @@ class BlockPublisher:
         sent = self.sent
         page = await self._database.call(BlockPage(PAGE_BLOCKS, after_id=sent))
         await self._publish(page)
-        if page and self.sent == sent:  # unless all blocks must be sent again
+        if page and self.sent == sent:  # else the caller has reset ``sent``
             self.sent = page[-1].id
         return bool(page)
 

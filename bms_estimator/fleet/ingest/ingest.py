@@ -99,9 +99,9 @@ CHECK_S = 2.0
 STATUS_S = 60.0
 """Interval between two log lines with the counters [s]."""
 YIELD_MESSAGES = 50
-"""Number of messages after which other tasks run."""
-PART_SAMPLES = 500
-"""Maximum number of samples, and therefore of completed blocks, after which other tasks run."""
+"""Number of messages after which the loop yields to other tasks."""
+MAX_PART_SAMPLES = 500
+"""Maximum number of samples, and therefore of completed blocks, after which the loop yields to other tasks."""
 
 log = structlog.get_logger(__name__)
 
@@ -151,19 +151,19 @@ class Ingest:
     async def run(self, stop: asyncio.Event) -> None:
         """Receive until ``stop`` is set; then complete the open blocks, and store and send them."""
         loop = asyncio.get_running_loop()
-        check_s = status_s = 0.0
+        next_check_s = next_status_s = 0.0
         while not stop.is_set():
             self._notifier.alive(NAME)
-            if loop.time() >= status_s:
-                status_s = loop.time() + STATUS_S
+            if loop.time() >= next_status_s:
+                next_status_s = loop.time() + STATUS_S
                 self._log_status()
-            is_check_due = loop.time() >= check_s
-            check_s = loop.time() + CHECK_S if is_check_due else check_s
+            is_check_due = loop.time() >= next_check_s
+            next_check_s = loop.time() + CHECK_S if is_check_due else next_check_s
             pause_s = await self._step(check=is_check_due)
             if pause_s:
                 await until_first_ends(asyncio.sleep(pause_s), stop.wait())
         self._notifier.stopping(NAME)
-        self._store.cut()
+        self._store.complete()
         await self._save()
         await self._store.send_remaining()
         self._log_status()
@@ -193,14 +193,14 @@ class Ingest:
         return 0.0 if messages else POLL_S
 
     async def _check(self) -> None:
-        """Do the work that is due every ``CHECK_S``."""
+        """Apply changes of the table, save overdue blocks, check the stream, and report readiness to systemd."""
         await self._bucket.refresh()
-        # an empty table is that of a new server, and removes nothing
+        # a new server has an empty table, which must not remove the packs
         for pack in self._store.packs if len(self._bucket.packs) else ():
             if pack not in self._bucket.packs:
                 log.info("a pack was removed from the table; its stored blocks are removed", pack=pack)
                 self._store.remove(pack)
-        self._store.cut(time.monotonic())  # blocks of packs that send nothing more
+        self._store.complete(time.monotonic())  # blocks of packs that send nothing more
         await self._save()
         await self._check_stream()
         if self._telemetry.warning:
@@ -208,7 +208,7 @@ class Ingest:
         self._notifier.ready(NAME)
 
     async def _check_stream(self) -> None:
-        """Check the stream, and replace it if it is missing or damaged."""
+        """Check the stream, and create it again if it is missing or damaged."""
         try:
             lost = await self._telemetry.check(self._store.progress.sequence)
             if lost is not None:
@@ -234,7 +234,7 @@ class Ingest:
 
     async def _save_open_blocks(self) -> None:
         """Complete and save the open blocks, because their batches cannot be read again."""
-        self._store.cut()
+        self._store.complete()
         await self._save()
 
     async def _save(self) -> None:
@@ -280,7 +280,7 @@ class Ingest:
             Exception: The batch is invalid. Earlier parts of it stay stored.
         """
         batch = self._reader.read(decode_batch(message.data))
-        for i, part in enumerate(split_by_time(batch, PART_SAMPLES)):
+        for i, part in enumerate(split_by_time(batch, MAX_PART_SAMPLES)):
             if i:
                 self._notifier.alive(NAME)
                 await asyncio.sleep(0)
@@ -303,7 +303,7 @@ class Ingest:
 
 
 def _reason(error: Exception) -> str:
-    """Return the reason of a rejected batch. The place of an internal error is part of it."""
+    """Return the reason of a rejected batch; for an internal error with file and line."""
     if isinstance(error, BatchError):
         return str(error)
     place = traceback.extract_tb(error.__traceback__)[-1]

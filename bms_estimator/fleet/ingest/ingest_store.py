@@ -48,6 +48,8 @@ log = structlog.get_logger(__name__)
 class IngestStore:
     """Edge of many packs, which divides their samples into blocks, stores and sends the blocks, and receives confirmations.
 
+    The blocks of a pack are numbered from 1 in its store, which is identified by its creation time.
+
     Args:
         nc: Connection to the tenant's NATS account, which reconnects.
         folder: Folder of the database.
@@ -68,7 +70,7 @@ class IngestStore:
         self._database = Database(folder / FILE, tables=INGEST_TABLES, sync_s=0.0, retry_s=RETRY_S)
         self._open_blocks = OpenBlocks(block_s)
         self._first_unconfirmed: dict[str, int] = {}
-        self._confirmed: dict[str, int] = {}  # numbers that the next transaction applies
+        self._confirmed: dict[str, int] = {}  # changes of ``_first_unconfirmed`` since the last transaction
         self._removed: set[str] = set()
         self._file_count = 0  # ``Database.open_count`` at the last transaction
         self._task: asyncio.Task[None] | None = None
@@ -100,7 +102,7 @@ class IngestStore:
 
     @property
     def packs(self) -> list[str]:
-        """Names of the known packs."""
+        """Names of the packs with a position."""
         return list(self._open_blocks)
 
     @property
@@ -114,10 +116,10 @@ class IngestStore:
         return next_number - self._first_unconfirmed.get(pack, next_number)
 
     async def request_confirmation(self, pack: str) -> None:
-        """Send the last block that a worker answers with a confirmation (``CONFIRM_EVERY``) again."""
+        """Send the last block again to which workers reply with a confirmation (``CONFIRM_EVERY``)."""
         number = (self._open_blocks.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY
         if number >= self._first_unconfirmed.get(pack, 1):
-            await self.publisher.send_again(pack, number)
+            await self.publisher.send_one_again(pack, number)
 
     def last_s(self, pack: str) -> float:
         """Return the time of a pack's last sample [s since 1970]."""
@@ -139,7 +141,7 @@ class IngestStore:
         self._set_end(pack, block.store_created_ns, last_sample_s(block))
 
     def add(self, pack: str, batch: BatchSamples, arrival_s: float, sequence: int) -> Selection:
-        """Add the new samples of a batch; see ``OpenBlocks.add``."""
+        """Add the new samples of a batch (``OpenBlocks.add``)."""
         self._first_unconfirmed.setdefault(pack, self._open_blocks.position(pack).next_number)
         return self._open_blocks.add(pack, batch, arrival_s, time.monotonic(), sequence)
 
@@ -150,9 +152,9 @@ class IngestStore:
         self._confirmed.pop(pack, None)
         self._removed.add(pack)
 
-    def cut(self, now_s: float = math.inf) -> None:
-        """Complete open blocks; see ``OpenBlocks.cut``."""
-        self._open_blocks.cut(now_s)
+    def complete(self, now_s: float = math.inf) -> None:
+        """Complete open blocks (``OpenBlocks.complete``)."""
+        self._open_blocks.complete(now_s)
 
     async def save(self, stream: str, sequence: int) -> None:
         """Write all changes to disk. Repeat until the disk accepts them.
@@ -224,18 +226,18 @@ class IngestStore:
             self._first_unconfirmed[pack] = max(self._first_unconfirmed.get(pack, 0), request.number)
             self._confirmed[pack] = self._first_unconfirmed[pack]
             if request.resend:
-                self.publisher.resend(pack, request.number)
+                self.publisher.request_resend(pack, request.number)
 
     def _begin_store(self, pack: str, other_ns: int) -> None:
-        """Replace the store of a pack by one that is created after another store [ns since 1970].
+        """Replace the store of a pack by a new one, created later than ``other_ns`` [ns since 1970].
 
-        Workers ignore the blocks of the former store. The samples of the open block are dropped too.
+        Workers ignore the blocks of the former store. The samples of the open block are dropped.
         """
         last_s = self._open_blocks.position(pack).last_s
         self.remove(pack)
         self._set_end(pack, other_ns, last_s)
 
     def _set_end(self, pack: str, store_ns: int, last_s: float) -> None:
-        """Begin a store with the first sample after ``last_s`` and after the creation of another store."""
-        created_s = math.ceil(store_ns / NS) + 1  # a sample after this time creates a store after the other one
+        """Begin a store at the next sample, and drop samples up to ``last_s`` and up to a second after another store's creation."""
+        created_s = math.ceil(store_ns / NS) + 1  # the first sample sets the creation time of the new store
         self._open_blocks.set_position(pack, PackPosition(0, 1, max(last_s, created_s)))

@@ -32,7 +32,7 @@ class _OpenPack:
 
 
 class OpenBlocks:
-    """Divider of the samples of packs into blocks.
+    """Samples of all packs that are in no block yet, and the blocks made of them.
 
     Args:
         block_s: Duration of a block [s].
@@ -87,40 +87,40 @@ class OpenBlocks:
         Raises:
             Exception: A block with samples of the batch cannot be encoded.
         """
-        entry = self._packs[pack]
-        selection = select_new(batch, entry.last_s, arrival_s)
+        open_pack = self._packs[pack]
+        selection = select_new(batch, open_pack.last_s, arrival_s)
         if not selection.samples.size:
             return selection
-        batcher = entry.batcher.copy()
+        batcher = open_pack.batcher.copy()
         completed = batcher.add(selection.samples, arrival_s, selection.cells_v)
-        self._complete(pack, entry, completed)
-        if completed or not len(entry.batcher):
-            entry.first_sequence, entry.opened_s = sequence, now_s
-        entry.batcher, entry.last_s = batcher, float(selection.samples["time_s"][-1])
+        self._complete(pack, open_pack, completed)
+        if completed or not len(open_pack.batcher):
+            open_pack.first_sequence, open_pack.opened_s = sequence, now_s
+        open_pack.batcher, open_pack.last_s = batcher, float(selection.samples["time_s"][-1])
         return selection
 
-    def cut(self, now_s: float = math.inf) -> None:
-        """Complete the open blocks that have been open for longer than ``MAX_BLOCK_AGE`` blocks; by default all.
+    def complete(self, now_s: float = math.inf) -> None:
+        """Complete the open blocks that are older than ``MAX_BLOCK_AGE`` times the duration of a block; by default all.
 
         The samples of a block that cannot be encoded are dropped, so that the other packs continue.
         """
-        for pack, entry in self._packs.items():
-            if len(entry.batcher) and now_s - entry.opened_s > MAX_BLOCK_AGE * self._block_s:
+        for pack, open_pack in self._packs.items():
+            if len(open_pack.batcher) and now_s - open_pack.opened_s > MAX_BLOCK_AGE * self._block_s:
                 try:
-                    self._complete(pack, entry, entry.batcher.cut())
+                    self._complete(pack, open_pack, open_pack.batcher.cut())
                 except Exception:
                     log.exception("samples of an open block are dropped, because it cannot be encoded", pack=pack)
 
     def first_sequence(self, default: int) -> int:
         """Return the smallest sequence number of a message with samples of open blocks; ``default`` without open blocks."""
-        sequences = (entry.first_sequence for entry in self._packs.values() if len(entry.batcher))
+        sequences = (open_pack.first_sequence for open_pack in self._packs.values() if len(open_pack.batcher))
         return min(sequences, default=default)
 
-    def _complete(self, pack: str, entry: _OpenPack, completed: list[ReadyBlock]) -> None:
-        position, blocks = entry.position, list[NumberedBlock]()
+    def _complete(self, pack: str, open_pack: _OpenPack, completed: list[ReadyBlock]) -> None:
+        position, blocks = open_pack.position, list[NumberedBlock]()
         for ready in completed:
             number, position = position.next_number, position.after(ready)
             blocks.append(NumberedBlock.of(pack, number, position.created_s, ready))
         if blocks:
             self.completed += blocks
-            entry.position = self.changed[pack] = position
+            open_pack.position = self.changed[pack] = position

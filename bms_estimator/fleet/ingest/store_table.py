@@ -27,7 +27,7 @@ INGEST_TABLES = (
 
 
 class PackPosition(NamedTuple):
-    """Position of a pack in its series of blocks."""
+    """Position of a pack in the blocks of its store."""
 
     created_s: int
     """Creation time of the pack's store [s since 1970]; 0 before its first block."""
@@ -76,7 +76,7 @@ class Progress(NamedTuple):
 
 @dataclass(frozen=True)
 class Changes:
-    """Idempotent transaction with all changes since the last one. It returns the number of dropped blocks.
+    """Idempotent transaction that writes all changes since the last one, and returns the number of dropped blocks.
 
     Raises:
         sqlite3.Error: The database cannot be written.
@@ -86,7 +86,7 @@ class Changes:
     blocks: Sequence[NumberedBlock] = ()
     positions: Mapping[str, PackPosition] = field(default_factory=dict)
     confirmed_below: Mapping[str, int] = field(default_factory=dict)
-    """Number by pack below which workers have confirmed all blocks."""
+    """Number of the first unconfirmed block, by pack."""
     removed: Collection[str] = ()
     """Packs whose blocks and position are removed, before blocks are inserted."""
 
@@ -153,9 +153,9 @@ class BlockPage:
     after_id: int = 0
     """Id of the last block before the page."""
     pack: str = ""
-    """Only blocks of this pack; empty: of all packs."""
+    """Pack of the blocks; empty: all packs."""
     first: int = 0
-    """Smallest number of a block, with ``pack``."""
+    """Smallest number of a block; used with ``pack``."""
 
     def __call__(self, connection: sqlite3.Connection) -> list[StoredBlock]:
         """Run the transaction."""

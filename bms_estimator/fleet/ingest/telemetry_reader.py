@@ -11,7 +11,7 @@ from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError, r
 from bms_estimator.fleet.nats.streams import NO_SUCH_STREAM
 
 WARNING_SHARE = 0.5
-"""Fraction of the maximum size of the stream above which a warning is due."""
+"""Fraction of the maximum size of the stream above which ``warning`` is set."""
 REQUEST_TIMEOUT_S = 5.0
 """Timeout of a request [s]."""
 UNAVAILABLE = 503
@@ -31,7 +31,7 @@ class DamagedStreamError(StreamError):
 
 
 class TelemetryReader:
-    """Reader with a position.
+    """Reader of batches after a position.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -46,9 +46,9 @@ class TelemetryReader:
 
     def __init__(self, nc: Client, stream: str, sequence: int) -> None:
         self._nc, self.stream, self.sequence, self.warning = nc, stream, sequence, ""
-        self._purged = 0  # all messages up to this one were removed
+        self._purged = 0  # last removed message
         self._last = 0  # last message in the stream at the last check
-        self._failures, self._retry_s = 0, 0.0
+        self._failures, self._next_check_s = 0, 0.0
 
     async def read(self) -> list[StoredMessage]:
         """Return some messages after the position; none at the end of the stream. The caller sets the position.
@@ -76,8 +76,8 @@ class TelemetryReader:
             processed: Sequence number up to which messages are removed.
 
         Returns:
-            Sequence numbers of unread messages that the server has lost, if the position was set; otherwise None. After a
-            change of the position the server has none of the processed messages.
+            Sequence numbers of lost messages if the position was set; then all messages in the stream are unprocessed. None if
+            the position is unchanged.
 
         Raises:
             MissingStreamError: The stream does not exist.
@@ -86,12 +86,12 @@ class TelemetryReader:
             nats.errors.Error: The server does not respond.
         """
         now_s = asyncio.get_running_loop().time()
-        if now_s < self._retry_s:
+        if now_s < self._next_check_s:
             return None
         try:
             lost = await self._check(processed)
         except DamagedStreamError:
-            self._retry_s = now_s + RETRY_S * 2**self._failures
+            self._next_check_s = now_s + RETRY_S * 2**self._failures
             self._failures += 1
             raise
         self._failures = 0
@@ -105,18 +105,20 @@ class TelemetryReader:
             nats.errors.Error: The server does not respond.
         """
         await self._request("DELETE", {})
-        self._failures, self._retry_s = 0, 0.0
+        self._failures, self._next_check_s = 0, 0.0
 
     async def _check(self, processed: int) -> range | None:
         unread = range(self.sequence + 1, self._last + 1)
         info = await self._request("INFO", {})
         state, created = info["state"], str(info["created"])
         if created != self.stream:
-            first = max(1, state["first_seq"])  # 0 in a new stream; above 1 if this process has lost its folder
+            first = max(
+                1, state["first_seq"]
+            )  # 0 in an empty stream; above 1 in a used stream, if this process has lost its folder
             self.stream, self.sequence, self._purged, self._last = created, first - 1, 0, 0
             return unread
         self._last = state["last_seq"]
-        if self._last < self.sequence:  # the server has lost the end of the stream: numbers are used again
+        if self._last < self.sequence:  # the server has lost the end of the stream, and assigns its numbers again
             self.sequence = self._purged = self._last
             return unread
         if state["first_seq"] > self.sequence + 1:  # the server has lost the beginning of the stream

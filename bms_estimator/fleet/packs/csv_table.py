@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from pydantic import ValidationError
 
-from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, encode_row, known_cells, model_key, model_of
+from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, encode_row, model_key, model_of, shipped_cell_names
 from bms_estimator.model.config_file import error_reason
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.one_of import suggestion
@@ -194,7 +194,7 @@ class _Reader:
             raise _RowError(
                 _error_text("cell", value, "its name before .toml must be 1 to 64 letters, digits, _ and -")
             )
-        if name in known_cells():
+        if name in shipped_cell_names():
             raise _RowError(_error_text("cell", value, f"{name} is a cell of the package; give the file another name"))
         if not self._files.setdefault(name, path).samefile(path):
             raise _RowError(_error_text("cell", value, f"another file of this name is {self._files[name]}; rename one"))

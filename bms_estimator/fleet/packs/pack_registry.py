@@ -7,7 +7,7 @@ unknown; ``PackRegistry.reason`` returns the error.
 from collections.abc import Collection, Iterator
 from functools import lru_cache
 
-from bms_estimator.fleet.packs.pack_row import PackSpec, decode_row, known_cells, model_of, settings_of
+from bms_estimator.fleet.packs.pack_row import PackSpec, decode_row, model_of, settings_of, shipped_cell_names
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.model.errors import UserError
@@ -15,13 +15,13 @@ from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.pack import Settings
 
 MAX_CACHED_SPECS = 1024
-"""Maximum number of cached specifications, each of which many packs share."""
+"""Maximum number of cached specifications. Many packs share one."""
 
 UNKNOWN_PACK = "not in the table of packs; add a row and load it with `bms-estimator fleet packs load`"
 
 
 class PackRegistry:
-    """Registry of rows and cell files, which returns settings and model of a pack.
+    """Registry of rows and cell files. A call returns settings and model of a pack.
 
     Attributes:
         rows: Row of each pack.
@@ -74,7 +74,7 @@ class PackRegistry:
 
     def cell_file(self, name: str) -> str | None:
         """Return the text of a cell file; None if it is missing or not used, because a shipped cell has this name."""
-        file = None if name in known_cells() else self.cell_files.get(name)
+        file = None if name in shipped_cell_names() else self.cell_files.get(name)
         return None if file is None else file.decode(errors="replace")
 
     def set_row(self, pack: str, data: bytes | None) -> bool:
@@ -98,7 +98,7 @@ class PackRegistry:
         return True
 
     def packs_using(self, cells: Collection[str]) -> set[str]:
-        """Return the packs that use one of ``cells``. The method searches all packs."""
+        """Return the packs that use one of ``cells``."""
         found = set[str]()
         for pack, data in self.rows.items() if cells else ():
             spec = self._parse(data)

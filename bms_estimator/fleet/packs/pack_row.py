@@ -35,7 +35,7 @@ _SECTIONS: dict[str, type[Strict]] = {"pack": PackSettings, "sensor": SensorSett
 
 
 class _CellName(Strict):
-    """Field ``cell``. It is in a base class of its own, the last one, because pydantic lists the fields of the last base first."""
+    """Field ``cell``. pydantic lists the fields of the last base class first, and ``cell`` is to be the first column."""
 
     cell: Annotated[str, Field(pattern=CELL_NAME)] = Field(
         description="generic chemistry lfp, nmc, nca, lco, lmo or lto (with capacity_ah), shipped cell, or cell file "
@@ -105,7 +105,7 @@ def settings_of(row: PackSpec) -> Settings:
     )
 
 
-def known_cells() -> tuple[str, ...]:
+def shipped_cell_names() -> tuple[str, ...]:
     """Return the names of all shipped cells."""
     return (*shipped_cells(), *generic_cells(), *shipped_fuel_cells())
 
@@ -125,18 +125,18 @@ def model_of(spec: PackSpec, cell_file: str | None) -> PackModel:
 
 
 def model_key(spec: PackSpec) -> tuple[object, ...]:
-    """Return the values that decide whether a specification has a valid model. Each key is checked only once."""
+    """Return the values that decide whether a specification has a valid model."""
     return spec.cell, spec.capacity_ah is None, spec.series, spec.parallel
 
 
 def cell_of(spec: PackSpec, cell_file: str | None) -> PackModel:
-    """Return the model in the cell file of a pack, before it is multiplied by ``series`` and ``parallel``; see ``model_of``."""
+    """Return the model of a single cell. Arguments and errors are those of ``model_of``."""
     name = spec.cell
-    if name in known_cells():
+    if name in shipped_cell_names():
         return load_model(name, spec.capacity_ah)
     if cell_file is None:
         raise UserError(
-            f"{name}: no cell file of this name was uploaded, and it is none of the shipped cells {', '.join(known_cells())}"
+            f"{name}: no cell file of this name was uploaded, and it is none of the shipped cells {', '.join(shipped_cell_names())}"
         )
     if not _is_fuel_cell(cell_file):
         cell = parse_toml(cell_file, CellModel, f"cell {name}")

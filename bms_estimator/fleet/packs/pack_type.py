@@ -1,7 +1,4 @@
-"""Type of packs. All packs of a type share one ``Pack``.
-
-It is shared because its creation takes longer than estimating the samples of a day.
-"""
+"""Type of packs. All packs of a type share one ``Pack``, because its creation takes longer than the estimation of a day's samples."""
 
 import hashlib
 import math
@@ -52,7 +49,7 @@ class PackType:
         capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
         cutoff_v: Voltage at which the load of a pack is switched off [V]; NaN for a fuel cell.
         filter_bytes: Settings of the estimator's filter, which other types may share; a view.
-        cell_file_bytes: These settings with the curves of the cell file.
+        cell_file_bytes: Settings of the filter with the curves of the cell file.
     """
 
     settings: PackSettings
@@ -116,7 +113,7 @@ class _EstimatorKey:
 def config_digest(settings: Settings, cell: PackModel) -> Digest:
     """Return the digest of all values that a pack's estimator is created from."""
     sensor, limits = settings.sensor, settings.charge_limits
-    # the digest of a pack without limits is that of earlier versions
+    # limits are a later addition: without them the digest stays that of earlier versions
     optional = () if limits == NO_LIMITS else (limits,)
     parts = (
         settings.observer,
@@ -133,7 +130,7 @@ def config_digest(settings: Settings, cell: PackModel) -> Digest:
 
 
 def bytes_of(settings: np.void) -> Bytes:
-    """Return a view of a record as bytes, whose copy takes a hundredth of the time of a copy by fields."""
+    """Return a view of a record as bytes. Copying it takes a hundredth of the time of copying the fields."""
     return np.frombuffer(settings, np.uint8)
 
 
@@ -170,7 +167,7 @@ class PackTypes:
 
 
 def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], advance: Advance) -> PackType:
-    """Create the type of packs with these settings. ``PackTypes`` describes the other arguments.
+    """Create the type of packs with these settings.
 
     Args:
         settings: Settings of the packs.

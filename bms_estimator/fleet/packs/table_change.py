@@ -10,7 +10,7 @@ import json
 from typing import NamedTuple
 
 MAGIC = b"BMST"
-"""First bytes of the message; those of a block differ."""
+"""First bytes of the message, different from those of a block."""
 
 
 class PackSource(NamedTuple):

@@ -1,4 +1,4 @@
-"""Loop that processes the delivered messages of all partitions of a worker in turn, and the messages of each partition.
+"""Loop that processes the delivered messages of all partitions of a worker in turn, and the queue of each partition.
 
 The event loop runs between two slices of messages, not between two messages. Therefore the results of a slice are written to
 the server together, and a message needs no switch of tasks. The block loop processes the messages of a partition as long as its
@@ -64,23 +64,23 @@ class BlockLoop:
 
 
 SILENCE_S = 3.0
-"""Time without a delivery after which the stream is searched for further messages [s]. Another worker releases the partition in
-less time."""
+"""Time without a delivery after which the stream is searched for further messages [s]. It exceeds the time in which another worker
+releases a partition."""
 
 
 class DeliveredMessages:
-    """Queue of one partition in the block loop.
+    """Delivered messages of one partition, as the block loop and the task of the partition process them.
 
     Args:
         consumer: Consumer of the partition.
-        guard: Guard of the partition.
+        guard: Guard against blocks that kill workers.
         results: Publisher of the results.
         block_loop: Loop of the worker.
         process: Processes a message that needs no request to the server.
         attempt: Runs an action and handles its errors.
 
     Attributes:
-        pin: Number of the pin under which the claim was last confirmed.
+        pin: Number of the pin (``DeliveredMessage.pin``) under which the claim was last confirmed.
         is_caught_up: True if the state includes all messages before the last delivered one.
         pin_lapsed: True if the ownership must be checked, because the pin has ended.
         next_search_s: Monotonic clock of the next search of the stream [s].
@@ -130,7 +130,7 @@ class DeliveredMessages:
 
     async def _publish(self) -> None:
         await self._results.publish_added()
-        await self._consumer.request_taken()
+        await self._consumer.refill()
 
     def postpone_search(self, silence_s: float = SILENCE_S) -> None:
         """Search the stream if no message has arrived for ``silence_s``."""

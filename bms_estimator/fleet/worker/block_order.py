@@ -38,8 +38,7 @@ by a machine whose clock was not set."""
 def density_fault(samples: SampleBlock) -> str:
     """Return the reason for which a block has too many samples; empty if the number is plausible.
 
-    ``EDGE_MAX_SAMPLES`` are allowed beyond the rate, because an edge's clock may stand still while a source's is
-    corrected.
+    ``EDGE_MAX_SAMPLES`` are allowed beyond the rate, because timestamps may stand still while the clock of a source is corrected.
     """
     if samples.size <= EDGE_MAX_SAMPLES:
         return ""
@@ -102,14 +101,14 @@ class BlockPosition(NamedTuple):
 
 
 class UnsavedPositions:
-    """Positions of the packs of a partition that blocks have changed since the last saves.
+    """Positions of packs before the blocks that the last checkpoints do not include.
 
-    A position that is not listed has not changed.
+    A pack that is not listed has had no block since.
     """
 
     def __init__(self) -> None:
-        self._at_snapshot: dict[str, BlockPosition] = {}  # positions at the last snapshot
-        self._at_save: dict[str, BlockPosition] = {}  # positions at the last save
+        self._at_snapshot: dict[str, BlockPosition] = {}  # positions in the last snapshot
+        self._at_save: dict[str, BlockPosition] = {}  # positions in the last saved snapshot
         # positions in the checkpoint before the last whole one; None until this worker has saved a whole checkpoint
         self._safe: dict[str, BlockPosition] | None = None
 
@@ -162,7 +161,7 @@ REQUEST_EVERY = 5
 """Number of early blocks between two replies that request a missing block."""
 
 MAX_EARLY_REPEATS = 20
-"""Number of arrivals of the first block after missing blocks at which the missing blocks count as lost.
+"""Number of arrivals of the first block after missing ones, at which the missing blocks count as lost.
 
 The edge resends the missing blocks and all later blocks at intervals of at least 30 s. If only later blocks arrive, the
 server rejects the missing blocks, or they are damaged on the edge's disk."""
@@ -177,66 +176,66 @@ class BlockOrder(Enum):
     AHEAD = "gaps"
     """An earlier block is missing."""
     FORMER_STORE = "former_store"
-    """From a store that the edge has since replaced by a newer one."""
+    """From an earlier store than that of the awaited block."""
 
 
-def classify_block(d: np.void, block: BlockHeader) -> BlockOrder:
+def classify_block(delivery: np.void, block: BlockHeader) -> BlockOrder:
     """Classify a block, and update the pack's delivery record.
 
     Args:
-        d: The pack's record of dtype ``DELIVERY``. The caller advances it past a ``NEXT`` block by ``mark_taken``.
+        delivery: The pack's record of dtype ``DELIVERY``. The caller advances it past a ``NEXT`` block by ``mark_processed``.
         block: Header of the received block.
     """
-    store, number = int(d["store"]), int(d["awaited"])
+    store, number = int(delivery["store"]), int(delivery["awaited"])
     if block.store_created_ns < store:
         return BlockOrder.FORMER_STORE
     if block.store_created_ns > store:
-        d["store"], number = block.store_created_ns, _await_block(d, 1)
+        delivery["store"], number = block.store_created_ns, _await_block(delivery, 1)
     if block.oldest > number:
-        number = _skip_lost_blocks(d, block.oldest)
+        number = _skip_lost_blocks(delivery, block.oldest)
     if block.number < number:
         return BlockOrder.RESENT
     if block.number > number:
-        d["ahead"] += 1
-        _count_first_early_block(d, block.number)
-        if d["passed"] < MAX_EARLY_REPEATS:
+        delivery["ahead"] += 1
+        _count_first_early_block(delivery, block.number)
+        if delivery["passed"] < MAX_EARLY_REPEATS:
             return BlockOrder.AHEAD
-        _skip_lost_blocks(d, block.number)
+        _skip_lost_blocks(delivery, block.number)
     return BlockOrder.NEXT
 
 
-def mark_taken(d: np.void) -> None:
+def mark_processed(delivery: np.void) -> None:
     """Record that the awaited block was processed, and await the next block.
 
     Args:
-        d: The pack's record of dtype ``DELIVERY``.
+        delivery: The pack's record of dtype ``DELIVERY``.
     """
-    _await_block(d, int(d["awaited"]) + 1)
-    d["blocks"] += 1
+    _await_block(delivery, int(delivery["awaited"]) + 1)
+    delivery["blocks"] += 1
 
 
-def _skip_lost_blocks(d: np.void, number: int) -> int:
+def _skip_lost_blocks(delivery: np.void, number: int) -> int:
     """Count the missing blocks before ``number`` as lost, await block ``number``, and return ``number``."""
-    d["lost_blocks"] = min(int(d["lost_blocks"]) + number - int(d["awaited"]), MAX_LOST_BLOCKS)
-    return _await_block(d, number)
+    delivery["lost_blocks"] = min(int(delivery["lost_blocks"]) + number - int(delivery["awaited"]), MAX_LOST_BLOCKS)
+    return _await_block(delivery, number)
 
 
-def _count_first_early_block(d: np.void, number: int) -> None:
-    """Count how often the lowest early block has arrived."""
-    if not d["first_ahead"] or number < d["first_ahead"]:
-        d["first_ahead"], d["passed"] = number, 0
-    d["passed"] += number == d["first_ahead"]
+def _count_first_early_block(delivery: np.void, number: int) -> None:
+    """Count the arrivals of the lowest early block."""
+    if not delivery["first_ahead"] or number < delivery["first_ahead"]:
+        delivery["first_ahead"], delivery["passed"] = number, 0
+    delivery["passed"] += number == delivery["first_ahead"]
 
 
-def _await_block(d: np.void, number: int) -> int:
+def _await_block(delivery: np.void, number: int) -> int:
     """Await block ``number``, reset the counts of early blocks, and return ``number``."""
-    d["awaited"], d["ahead"], d["first_ahead"], d["passed"] = number, 0, 0, 0
+    delivery["awaited"], delivery["ahead"], delivery["first_ahead"], delivery["passed"] = number, 0, 0, 0
     return number
 
 
-def position(d: np.void) -> BlockPosition:
+def position(delivery: np.void) -> BlockPosition:
     """Return the position of a pack, from its record of dtype ``DELIVERY``."""
-    return BlockPosition(int(d["store"]), int(d["awaited"]))
+    return BlockPosition(int(delivery["store"]), int(delivery["awaited"]))
 
 
 def edge_reply(

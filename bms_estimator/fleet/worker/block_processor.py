@@ -52,7 +52,7 @@ NO_PEAK_A = 0.0
 """Peak current for ``write_usable_charge`` [A]. A worker does not store the peaks of the load. With 0, the mean current is
 used."""
 NO_CELL_STATES = np.zeros(0, CELL)
-"""States of the single cells of a pack without any."""
+"""States of no single cells."""
 NO_FORECAST_REASON = "a fleet worker makes no forecasts"
 
 
@@ -89,7 +89,7 @@ class BlockProcessor:
             pack_type: Type of the pack; its estimator is bound to the record.
             unmigrated_fields: Estimator fields that another version saved; None if they are already in the record.
         """
-        self._check_times(block.samples)
+        self._remove_implausible_times(block.samples)
         self._fits.use_curves(pack, pack_type)
         if self._restore_or_reset(pack_type, unmigrated_fields, block):
             self._fits.use_curves(pack, pack_type)
@@ -97,7 +97,7 @@ class BlockProcessor:
         self._load_cells(pack_type)
         is_new_time_base = int(self._delivery[LAST_STORE_NS]) != block.store_created_ns
         rows, is_new_hour = self._roll_over_hour(pack, block, arrival, pack_type, is_new_time_base=is_new_time_base)
-        self._check_clock(block, arrival)
+        self._record_clock_error(block, arrival)
         self._alarms.begin_block(pack_type, is_new_time_base=is_new_time_base)
         self._resume_after_store_change(pack_type, block)
         # another pack may have used the window meanwhile
@@ -116,7 +116,7 @@ class BlockProcessor:
             state=state,
             parameters=parameters,
             cells=cells,
-            alarms=self._alarms.messages(pack_type, trace, now_s, is_whole=is_new_hour),
+            alarms=self._alarms.messages(pack_type, trace, now_s, include_unchanged=is_new_hour),
             hours=rows,
             history=self._fits.take_messages(),
         )
@@ -130,7 +130,7 @@ class BlockProcessor:
         self._window = Window()
 
     def _restore_or_reset(self, pack_type: PackType, unmigrated_fields: Fields | None, block: Block) -> bool:
-        """Adapt the pack's state to its present settings and this version. Reset an incompatible state. Return True if it has changed."""
+        """Adapt the pack's state to its present settings and this version, or reset it. Return True if it has changed."""
         d, record = self._delivery, self._record[0]
         is_same_config = _digest(d[CONFIG_DIGEST]) == pack_type.config_digest
         if is_same_config and unmigrated_fields is None:
@@ -163,7 +163,7 @@ class BlockProcessor:
         return True
 
     def _load_cells(self, pack_type: PackType) -> None:
-        """Let the estimators of the single cells use the state in the record, which may have none."""
+        """Let the estimators of the single cells use the state in the record; without one, an empty state."""
         cells, unpacked = pack_type.cells, self._unpacked
         if unpacked.cell_count:
             cells.use_state(unpacked.cells, unpacked.bank)
@@ -171,21 +171,21 @@ class BlockProcessor:
             cells.use_state(NO_CELL_STATES, np.zeros(1, BANK_STATE))
 
     def _store_cells(self, pack_type: PackType) -> None:
-        """Store the state of the single cells in the record if their number has changed, or they have other arrays."""
+        """Copy the state of the single cells to the record, which gets space for their number."""
         cells = pack_type.cells
         self._unpacked.start_cells(cells.cells.size)
         if cells.cells.size:
             self._unpacked.cells[...], self._unpacked.bank[...] = cells.cells, cells.bank
 
     def _resume_after_store_change(self, pack_type: PackType, block: Block) -> None:
-        """Resume the estimator after a gap if the edge's store is another one than for the last sample.
+        """Resume the estimator after a gap if the block has another store than the last sample.
 
         Timestamps count from the creation of the store, and therefore the estimator cannot compute the gap.
         """
         if int(self._delivery[LAST_STORE_NS]) == block.store_created_ns:
             return
         self._charge_energy["sums"]["counted"] = 0  # no charge is counted over the gap
-        # infinite if ``_restore_or_reset`` has already resumed the estimator
+        # ``time_s`` is infinite if ``_restore_or_reset`` has already resumed the estimator
         has_time_base = math.isfinite(self._observer["time_s"])
         if self._observer["started"] and has_time_base:
             gap_s = self._gap_s(block)
@@ -202,8 +202,8 @@ class BlockProcessor:
         pack_type.meter.continue_from(
             ChargeEnergy(*(float(self._charge_energy[name]) for name in ChargeEnergy._fields))
         )
-        is_complete = block.cells_v.shape[1] == cells.estimated_cells <= MAX_CELLS
-        cells_v = block.cells_v if is_complete else NO_CELLS
+        has_all_cells = block.cells_v.shape[1] == cells.estimated_cells <= MAX_CELLS
+        cells_v = block.cells_v if has_all_cells else NO_CELLS
         wall_offset_s = arrival_s - float(self._delivery["last_s"])
         for start in range(0, block.samples.size, MAX_PART_SAMPLES):
             part = slice(start, start + MAX_PART_SAMPLES)
@@ -255,7 +255,7 @@ class BlockProcessor:
         cells = pack_type.cells.deviations
         return None if cells is None else _json(make_cells_payload(cells, pack_type.short_limit_a, now_s))
 
-    def _check_times(self, samples: SampleBlock) -> None:
+    def _remove_implausible_times(self, samples: SampleBlock) -> None:
         """Set implausible timestamps to NaN."""
         times = samples["time_s"]
         plausible = (times >= 0.0) & (times <= MAX_TIMESTAMP_S)
@@ -263,7 +263,7 @@ class BlockProcessor:
             self._counters["no_time"] += int(np.count_nonzero(~plausible))
             times[~plausible] = math.nan
 
-    def _check_clock(self, block: Block, arrival: Arrival) -> None:
+    def _record_clock_error(self, block: Block, arrival: Arrival) -> None:
         """Record an error of the edge's clock, which quarantines the row of the current hour."""
         if error_s := clock_error_s(block, arrival.received_s):
             self._delivery["clock_error_s"] = error_s
@@ -304,7 +304,7 @@ class BlockProcessor:
         return rows, True
 
     def _origin(self, arrival: Arrival) -> dict[str, float | None]:
-        """Return the fields of a row that describe the block that finished the hour, and the clock of the hour's blocks."""
+        """Return the fields of a row about the block that finished the hour, and about the clock of the edge."""
         received_s, error_s = arrival.received_s, float(self._delivery["clock_error_s"])
         return {
             "revision": arrival.sequence,
@@ -337,7 +337,7 @@ def _finite_times_s(samples: SampleBlock) -> NDArray[np.float64]:
 
 
 def known_voltages(cells_v: CellBlock) -> CellBlock:
-    """Return the rows with a voltage, because an edge does not send the cell voltages of all samples of a large block."""
+    """Return the rows with a voltage. In a large block, an edge sends no cell voltages for some samples."""
     return cells_v[np.isfinite(cells_v).any(axis=1)] if cells_v.size else cells_v
 
 

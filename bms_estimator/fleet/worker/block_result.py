@@ -28,8 +28,8 @@ class AlarmMessage(NamedTuple):
     payload: bytes
 
 
-class HistoryMessage(NamedTuple):
-    """Rows of a pack's history, or a request for a fit, which the server stores."""
+class QueuedMessage(NamedTuple):
+    """Hourly summary, rows of a pack's history, or request for a fit, which the server must store."""
 
     subject: str
     data: bytes
@@ -61,13 +61,13 @@ class BlockResult(NamedTuple):
     cells: bytes | None = None
     alarms: tuple[AlarmMessage, ...] = ()
     hours: tuple[tuple[str, bytes], ...] = ()
-    history: tuple[HistoryMessage, ...] = ()
+    history: tuple[QueuedMessage, ...] = ()
     failed: int = 0
     dead_reason: str = ""
 
 
 MAX_MERGED_ALARMS = 256
-"""Maximum number of messages about alarms and events of a pack that are published after a replay of the stream, the newest."""
+"""Maximum number of messages about alarms and events of a pack after a replay of the stream. The newest are published."""
 MAX_PENDING = 128
 """Maximum number of published messages that wait for the server's acknowledgment."""
 
@@ -86,7 +86,7 @@ class ResultPublisher:
 
     def __init__(self, nc: Client) -> None:
         self._nc = nc
-        self.waiting: deque[HistoryMessage] = deque()
+        self.waiting: deque[QueuedMessage] = deque()
         self.waiting_dead_letters: deque[DeadLetter] = deque()
         self.added: list[BlockResult] = []
         self._send_lock = asyncio.Lock()
@@ -96,10 +96,10 @@ class ResultPublisher:
         """True if the server has not acknowledged all queued messages."""
         return bool(self.waiting or self.waiting_dead_letters)
 
-    def queue_stored(self, result: BlockResult) -> None:
-        """Queue the hourly summaries of a result, and its messages of the history."""
+    def queue(self, result: BlockResult) -> None:
+        """Queue the hourly summaries and the history messages of a result."""
         subject = subjects.hours(result.pack)
-        self.waiting.extend(HistoryMessage(subject, row, message_id) for message_id, row in result.hours)
+        self.waiting.extend(QueuedMessage(subject, row, message_id) for message_id, row in result.hours)
         self.waiting.extend(result.history)
 
     def queue_dead_letter(self, letter: DeadLetter) -> None:

@@ -29,7 +29,7 @@ MAX_CHARGE_S = 0.1
 """Maximum processor time that is charged for one block [s], the cost of 20,000 samples. The first block may take longer,
 because it compiles kernels."""
 MAX_PACKS = 10_000
-"""Number of stored bucket levels above which the levels of idle packs, which are 0, are removed."""
+"""Number of stored bucket levels above which levels of 0, those of idle packs, are removed."""
 
 
 class CpuBudget:
@@ -75,8 +75,8 @@ class BlockRunner:
         partitions: Number of partitions of the stream.
         worker: Name of the worker.
         step_lock: Lock of the worker (``BlockLoop``), held while a block is processed.
-        guard: Guard of the partition.
-        results: Publisher of summaries and dead letters.
+        guard: Guard against blocks that kill workers.
+        results: Publisher of the results.
         on_table_change: Called with the pack after its row of the table has changed.
         save: Writes a checkpoint.
         on_deferred: Called after a message was deferred.
@@ -119,18 +119,18 @@ class BlockRunner:
         if result is not None:
             await asyncio.sleep(0)  # lets the event loop send heartbeats while many messages are deferred
             return result
-        take = partial(partition.take, received_s=message.received_s)
-        result = await self.run(pack, message.data, message.sequence, take)
-        self._count_taken(partition, pack, message.data)
+        process_message = partial(partition.process, received_s=message.received_s)
+        result = await self.run(pack, message.data, message.sequence, process_message)
+        self._count_processed(partition, pack, message.data)
         return result
 
     def process_unguarded(self, partition: Partition, pack: str, message: DeliveredMessage) -> BlockResult:
         """Process or defer a message that does not belong to a guarded replay, without a request to the server."""
         result = self._reject_or_defer(partition, pack, message.sequence)
         if result is None:
-            take = partial(partition.take, received_s=message.received_s)
-            result = self._run_unguarded(pack, message.data, message.sequence, take)
-            self._count_taken(partition, pack, message.data)
+            process_message = partial(partition.process, received_s=message.received_s)
+            result = self._run_unguarded(pack, message.data, message.sequence, process_message)
+            self._count_processed(partition, pack, message.data)
         return result
 
     def _reject_or_defer(self, partition: Partition, pack: str, sequence: int) -> BlockResult | None:
@@ -142,12 +142,14 @@ class BlockRunner:
         self._on_deferred()
         return partition.defer(pack, sequence)
 
-    def _count_taken(self, partition: Partition, pack: str, data: bytes) -> None:
-        """Count a block, unless ``Partition.take`` has deferred it."""
+    def _count_processed(self, partition: Partition, pack: str, data: bytes) -> None:
+        """Count a block, unless ``Partition.process`` has deferred it."""
         if pack not in partition.deferred:
             self.count_block(data)
 
-    async def run(self, pack: str, data: bytes, sequence: int, take: Callable[..., BlockResult]) -> BlockResult:
+    async def run(
+        self, pack: str, data: bytes, sequence: int, process_message: Callable[..., BlockResult]
+    ) -> BlockResult:
         """Process a message while no other block is processed. ``_run_unguarded`` describes the arguments.
 
         Raises:
@@ -156,14 +158,20 @@ class BlockRunner:
         async with self._step_lock:
             await asyncio.sleep(0)  # lets the event loop send heartbeats between two blocks
             is_lethal = await self._guard.is_lethal(sequence)
-            result = self._run_unguarded(pack, data, sequence, take, is_lethal=is_lethal)
+            result = self._run_unguarded(pack, data, sequence, process_message, is_lethal=is_lethal)
             await self._guard.end_block(sequence)
         if is_lethal:
             await self._save()  # the next owner must not process the block again
         return result
 
     def _run_unguarded(
-        self, pack: str, data: bytes, sequence: int, take: Callable[..., BlockResult], *, is_lethal: bool = False
+        self,
+        pack: str,
+        data: bytes,
+        sequence: int,
+        process_message: Callable[..., BlockResult],
+        *,
+        is_lethal: bool = False,
     ) -> BlockResult:
         """Process a message, and charge the processor time to its pack.
 
@@ -171,21 +179,21 @@ class BlockRunner:
             pack: Name of the pack.
             data: Bytes of the message.
             sequence: Stream sequence number of the message.
-            take: ``Partition.take`` or ``Partition.take_deferred``.
+            process_message: ``Partition.process`` or ``Partition.process_deferred``.
             is_lethal: True if the block has killed workers.
         """
         begin_s = time.thread_time()
         try:
-            result = take(pack, data, sequence, is_lethal=is_lethal)
-        except Exception:  # an internal error with one pack, which would otherwise end one worker after another
+            result = process_message(pack, data, sequence, is_lethal=is_lethal)
+        except Exception:  # otherwise the message would end each worker that takes over the partition
             log.exception("a block is skipped", partition=self._number, pack=pack, sequence=sequence)
             result = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR)
         self.budget.charge(pack, time.thread_time() - begin_s)
         self.faults += result.failed
-        self._results.queue_stored(result)
+        self._results.queue(result)
         if result.dead_reason:
             self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
-        if is_change(data):  # the table may have changed again since this change was sent
+        if is_change(data):  # a later change of the table may still have to be sent
             self._on_table_change(pack)
         return result
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
-MAX_UNKNOWN = 8192
+MAX_DEFERRED_PACKS = 8192
 """Maximum number of packs of a partition with deferred messages, because a server without tenants accepts any name."""
 
 
@@ -49,7 +49,7 @@ class Deferred:
         self._spans[pack] = Span(before.first if before else sequence, sequence)
 
     def next(self, is_due: Callable[[str], bool]) -> tuple[str, Span] | None:
-        """Return the next due pack and its span, and move it to the end of the queue. Return None if no pack is due."""
+        """Return the next due pack and its span, and move the pack to the end of the queue; None if no pack is due."""
         pack = next(filter(is_due, self._spans), None)
         if pack is None:
             return None

@@ -24,7 +24,7 @@ from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.version import __version__
 
 MAX_LISTED = 20
-"""Maximum number of packs of each kind that a heartbeat names: unknown packs, packs with a wrong clock."""
+"""Maximum number of unknown packs, and of packs with a wrong clock, that a heartbeat names."""
 
 
 class HeartbeatReport:
@@ -40,7 +40,7 @@ class HeartbeatReport:
 
     def __init__(self, name: str) -> None:
         self._name, self.started_s, self.totals = name, time.time(), LeaseTotals()
-        # monotonic clock since which a partition has blocks that its checkpoint of this sequence number does not include
+        # monotonic time since which blocks of a partition are unsaved, by lease and sequence number of its checkpoint
         self._unsaved_since: dict[tuple[PartitionLease, int], float] = {}
 
     def make(
@@ -181,7 +181,7 @@ class Membership:
         self._last_heartbeat_s[worker], self._last_heartbeat[worker] = now_s, heartbeat
         return is_new
 
-    def extend_all(self, now_s: float) -> None:
+    def extend_deadlines(self, now_s: float) -> None:
         """Extend the deadline of all workers after a time without a connection, in which no heartbeat could arrive."""
         self._last_heartbeat_s = dict.fromkeys(self._last_heartbeat_s, now_s)
 

@@ -27,7 +27,7 @@ REST_C = 0.01
 """Maximum current of a resting pack, as a C-rate [1/h]."""
 
 SIGNIFICANT_STDS = 3.0
-"""Number of std by which the deviation of a cell is reduced in the choice of the weakest cell and of that with the highest
+"""Number of std that are subtracted from the deviation of a cell to select the weakest cell and the one with the highest
 resistance."""
 
 Sums = NDArray[np.void]
@@ -62,7 +62,7 @@ def add(sums: Sums, trace: TraceBlock, samples: int, store_ns: int, estimator: E
         trace: Estimates of the samples.
         samples: Number of samples, of which the estimator may have rejected some.
         store_ns: Creation time of the edge's store [ns since 1970].
-        estimator: Estimator of the pack, or of another pack of its type: only its settings are read.
+        estimator: Estimator of the pack's type; only its settings are read.
     """
     gap_s = float(estimator.settings[0]["gap_s"])
     accumulate_hour(sums, trace, int(sums["store"][0]) != store_ns, gap_s, rest_current_a(estimator))

@@ -31,5 +31,5 @@ def load_fleet_kernels() -> None:
         block = Block(
             store_created_ns=store, number=1, oldest=1, arrival_s=store / 1e9, samples=samples, cells_v=cells_v
         )
-        partition.take(PACK, encode(block), sequence)
+        partition.process(PACK, encode(block), sequence)
     load_kernels()

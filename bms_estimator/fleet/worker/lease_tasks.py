@@ -20,12 +20,12 @@ from bms_estimator.process.tasks import end
 
 log = structlog.get_logger(__name__)
 
-PROCESSED = frozenset({"blocks", "samples", "packs", "unknown"})
-"""Counters of a partition that are no events: the heartbeat has them in fields of their own."""
+NOT_EVENTS = frozenset({"blocks", "samples", "packs", "unknown"})
+"""Counters of a partition that are no events. The heartbeat has separate fields for them."""
 
 
 class SourceSum:
-    """Sum of the counters of changing sources. It does not fall when a source disappears."""
+    """Sum of the counters of sources that come and go. It still includes removed sources."""
 
     def __init__(self) -> None:
         self._former = Counter[str]()
@@ -46,24 +46,24 @@ class LeaseTotals:
     """Totals over all leases of a worker since its start."""
 
     def __init__(self) -> None:
-        self._runs, self._events = SourceSum(), SourceSum()
+        self._counts, self._events = SourceSum(), SourceSum()
 
     def update(self, leases: Iterable[PartitionLease]) -> None:
         """Read the counters of the present leases. Call it before a lease is removed."""
-        self._runs.update({lease.runner: _run_counts(lease) for lease in leases})
+        self._counts.update({lease.runner: _run_counts(lease) for lease in leases})
         self._events.update({lease.partition: _event_counts(lease) for lease in leases if lease.partition})
 
     def processed(self) -> dict[str, int]:
         """Return the numbers of blocks, samples, faults and dead letters."""
-        counts = self._runs.total()
+        counts = self._counts.total()
         return {name: counts[name] for name in ("blocks", "samples", "faults", "dead_letters")}
 
     def estimation_s(self) -> float:
         """Return the processor time of estimation [s]."""
-        return self._runs.total()["estimation_us"] / 1e6
+        return self._counts.total()["estimation_us"] / 1e6
 
     def events(self) -> dict[str, int]:
-        """Return the numbers of events of the partitions by name, from the claim of each partition on."""
+        """Return the numbers of events in this worker by name."""
         return dict(self._events.total())
 
 
@@ -82,7 +82,7 @@ def _event_counts(lease: PartitionLease) -> Counter[str]:
     if lease.partition is None:
         return Counter()
     counted = Counter(lease.partition.counters) - Counter(lease.restored_counters)
-    return Counter({name: count for name, count in counted.items() if name not in PROCESSED})
+    return Counter({name: count for name, count in counted.items() if name not in NOT_EVENTS})
 
 
 MAX_RELEASES = 8
@@ -90,7 +90,7 @@ MAX_RELEASES = 8
 
 
 class LeaseTasks:
-    """Leases by partition. A lease remains until its release has ended.
+    """Leases of a worker and their tasks. A lease is removed after its release.
 
     Args:
         totals: Totals over all leases, updated before a lease is removed.
@@ -119,7 +119,7 @@ class LeaseTasks:
         return self._leases.get(number)
 
     def start(self, lease: PartitionLease) -> None:
-        """Process the messages of a partition until its release."""
+        """Start a task that processes the messages of a partition until its release."""
         self._leases[lease.number] = lease
         self._tasks[lease.number] = asyncio.create_task(lease.run())
 
@@ -202,7 +202,7 @@ class PeriodicStorage:
 
 
 class UnsavedCheck:
-    """Check of the partitions of one worker.
+    """Check for unsaved blocks (``nats.unsaved_blocks``) in the partitions of one worker.
 
     Args:
         nc: Connection to the tenant's NATS account.

@@ -1,6 +1,6 @@
 """Alarms and events of the pack whose record is loaded, evaluated with each block.
 
-A worker has neither a line to the source nor hooks nor forecasts. Therefore it does not evaluate ``collapse_risk``, ``hook_failed``
+A worker has neither a link to the source nor hooks nor forecasts. Therefore it does not evaluate ``collapse_risk``, ``hook_failed``
 and ``alarm_state_lost``, and raises ``link_lost`` for a gap when the next samples arrive. No alarm latches.
 """
 
@@ -40,11 +40,11 @@ class PackAlarms:
     def __init__(self, record: NDArray[np.void]) -> None:
         self._alarms, self._estimator = record["alarms"], record["estimator"]
         self._states: NDArray[np.void] = self._alarms[0]["states"]
-        self._kernel = Evaluation()
+        self._evaluation = Evaluation()
         self._samples: SampleBlock = np.zeros(0, SAMPLE)  # last samples of the block
-        self._impossible: list[str] = []  # descriptions of their impossible values
-        self._has_events = False  # the estimator has changed, which is an event
-        self._cell_windows = self._fits = 0  # numbers before the block
+        self._impossible: list[str] = []  # descriptions of impossible values in ``_samples``
+        self._has_events = False  # True if the block has changed the estimator in a way that is an event
+        self._cell_windows = self._fits = 0  # numbers of cell estimates and of fits before the block
 
     def begin_block(self, pack_type: PackType, *, is_new_time_base: bool) -> None:
         """Begin a block of the loaded pack.
@@ -55,7 +55,7 @@ class PackAlarms:
         """
         if is_new_time_base:
             begin_time_base(self._alarms)
-        self._kernel.clear()
+        self._evaluation.clear()
         self._has_events = False
         self._cell_windows = int(pack_type.cells.bank["windows"][0])
         self._fits = pack_type.pack.slow_fit.changes if pack_type.pack.slow_fit else 0
@@ -72,10 +72,12 @@ class PackAlarms:
             trace: Their estimates.
             wall_offset_s: Wall clock of the edge minus the samples' clock [s].
         """
-        part, slow_fit = self._kernel.part[0], pack_type.pack.slow_fit
+        part, slow_fit = self._evaluation.part[0], pack_type.pack.slow_fit
         part["wall_offset_s"], part["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
         part["cells_at_s"], part["short_a"], part["reading_v"] = self._cell_values(pack_type)
-        self._has_events |= self._kernel.run(self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace)
+        self._has_events |= self._evaluation.run(
+            self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace
+        )
         self._samples = samples
         self._impossible = [
             pack_type.alarms.bounds.describe(
@@ -104,7 +106,7 @@ class PackAlarms:
         return tuple(NAMES[k] for k in np.flatnonzero(self._states["raised"]))
 
     def messages(
-        self, pack_type: PackType, trace: TraceBlock, now_s: float, *, is_whole: bool
+        self, pack_type: PackType, trace: TraceBlock, now_s: float, *, include_unchanged: bool
     ) -> tuple[AlarmMessage, ...]:
         """Return the messages about the changes of the block, and its events.
 
@@ -112,23 +114,23 @@ class PackAlarms:
             pack_type: Type of the pack.
             trace: Last estimates of the block; empty without any.
             now_s: Wall clock [s since 1970].
-            is_whole: True: also about alarms that have been raised or unwatched since an earlier block.
+            include_unchanged: True to include the raised and unwatched alarms that the block has not changed.
         """
         slow_fit = pack_type.pack.slow_fit
-        entries = self._kernel.entries
-        if not (entries.size or self._has_events or is_whole or (slow_fit and slow_fit.changes > self._fits)):
+        entries = self._evaluation.entries
+        if not (entries.size or self._has_events or include_unchanged or (slow_fit and slow_fit.changes > self._fits)):
             return ()
         positions = set(entries["alarm"].tolist())
-        if is_whole:
+        if include_unchanged:
             positions |= set(np.flatnonzero(self._states["raised"] | self._states["unwatched"]).tolist())
         positions &= pack_type.alarms.by_position.keys()
         about_alarms = (each for k in sorted(positions) for each in self._messages_of(k, pack_type, trace, now_s))
         return (*about_alarms, *(_event(text, now_s) for text in self._events(pack_type)))
 
     def _messages_of(self, k: int, pack_type: PackType, trace: TraceBlock, now_s: float) -> Iterator[AlarmMessage]:
-        """Yield the messages about alarm ``k``: its raising in this block, and its present state, unless they are equal."""
+        """Yield the messages about alarm ``k``: events of this block, and its state. If it was raised and has ended, yield both states."""
         state, definition = self._states[k], pack_type.alarms.by_position[k]
-        entries = self._kernel.entries
+        entries = self._evaluation.entries
         changes = {int(entry["kind"]): entry for entry in entries[entries["alarm"] == k]}  # the last one of each kind
         lost = lost_quantities(self._alarms[0])
         missing = [
@@ -165,7 +167,7 @@ class PackAlarms:
         yield _message(present)
 
     def _events(self, pack_type: PackType) -> Iterator[EventText]:
-        """Yield the events since the last call that no alarm causes."""
+        """Yield the events since the last call, except those of alarms."""
         slow_fit, record = pack_type.pack.slow_fit, self._estimator[0]
         if slow_fit and slow_fit.changes > self._fits and (change := last_change(slow_fit)):
             yield fit_event(change)

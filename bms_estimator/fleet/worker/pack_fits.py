@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import COMPARED, FitRequest, FitResult, Rows, RowsPosition, encode_rows
 from bms_estimator.fleet.packs.pack_type import Bytes, PackType, WorkerFit, bytes_of
-from bms_estimator.fleet.worker.block_result import HistoryMessage
+from bms_estimator.fleet.worker.block_result import QueuedMessage
 from bms_estimator.fleet.worker.pack_state import PACK_FIT
 from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, FREE_ROWS
 from bms_estimator.pack_model.bank_comparison import ComparedCell
@@ -27,9 +27,9 @@ from bms_estimator.pack_model.saved import curve_arrays, fit_of_curves
 from bms_estimator.pack_model.slow_fit import ADOPT_DELAY_S, fit_interval
 
 MAX_CACHED_CURVES = 4096
-"""Maximum number of packs of a partition whose curves are cached [13 kB each]. Other curves are computed with each block."""
+"""Maximum number of packs of a partition whose curves are cached, 13 kB each. Other curves are computed for each block."""
 FULL_ROWS = COMPLETED_ROWS - FREE_ROWS
-"""Number of completed rows at which the kernel returns, so that they are taken."""
+"""Number of completed rows at which the kernel returns, so that they are sent."""
 
 
 class PackFits:
@@ -41,12 +41,12 @@ class PackFits:
     """
 
     def __init__(self, record: NDArray[np.void], counters: Counter[str]) -> None:
-        self._fit, self._h = record[0]["fit"], record[0]["estimator"]["history"]
+        self._fit, self._history = record[0]["fit"], record[0]["estimator"]["history"]
         self._filter = record[0]["estimator"]["filter"]
         self._counters = counters
         self._curves = lru_cache(MAX_CACHED_CURVES)(self._compute_curves)
         self._pack, self._digest, self._sequence = "", (0, 0), 0
-        self._messages: list[HistoryMessage] = []
+        self._messages: list[QueuedMessage] = []
 
     def use_curves(self, pack: str, pack_type: PackType) -> None:
         """Write the pack's curves in force to the settings of its estimator, which other packs share."""
@@ -72,8 +72,8 @@ class PackFits:
         if isinstance(slow_fit := pack_type.pack.slow_fit, WorkerFit) and slow_fit.bank:
             slow_fit.bank.weakest = weakest_of_record(self._fit)
         self._pack, self._digest, self._sequence, self._messages = pack, pack_type.state_digest, sequence, []
-        if pack_type.pack.slow_fit and not self._h["enabled"]:
-            pack_type.estimator.schedule(self._h["elapsed_s"] + pack_type.pack.slow_fit.interval())
+        if pack_type.pack.slow_fit and not self._history["enabled"]:
+            pack_type.estimator.schedule(self._history["elapsed_s"] + pack_type.pack.slow_fit.interval())
 
     def curves_in_force(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of the fit in force (``PackState.curves``); empty without one."""
@@ -81,23 +81,23 @@ class PackFits:
         return curve_arrays(fit_of_record(fit) if fit["sequence"] else None)
 
     def restart(self, pack_type: PackType) -> None:
-        """Drop a request, because the pack's settings have changed. The next block begins a new interval.
+        """Drop a request, because the pack's settings have changed. The next block begins a new interval between fits.
 
         Without fits, the curves are those of the cell file.
         """
-        self._fit["request"], self._fit["received"], self._h["enabled"] = 0, np.zeros((), PACK_FIT), 0
+        self._fit["request"], self._fit["received"], self._history["enabled"] = 0, np.zeros((), PACK_FIT), 0
         if pack_type.pack.slow_fit is None:
             self._fit["in_force"] = np.zeros((), PACK_FIT)
 
     def advance(self, slow_fit: WorkerFit) -> None:
-        """Take completed rows, and request or adopt a fit that is due."""
-        h = self._h
+        """Send completed rows, and request or adopt a fit that is due."""
+        h = self._history
         if h["elapsed_s"] >= h["event_s"]:
             self._handle_event(slow_fit)
         elif h["count"] >= FULL_ROWS:
             self._send_rows(slow_fit)
 
-    def take_messages(self) -> tuple[HistoryMessage, ...]:
+    def take_messages(self) -> tuple[QueuedMessage, ...]:
         """Return the messages of the block."""
         return tuple(self._messages)
 
@@ -109,7 +109,7 @@ class PackFits:
             sequence: Stream sequence number of its message.
             pack_type: Type of the pack.
         """
-        fit, h, slow_fit = self._fit, self._h, pack_type.pack.slow_fit
+        fit, h, slow_fit = self._fit, self._history, pack_type.pack.slow_fit
         if not isinstance(slow_fit, WorkerFit) or fit["request"] != result.request:
             return False
         if not result.is_fitted:
@@ -120,12 +120,12 @@ class PackFits:
         write_fit(fit["received"], result, sequence)
         write_weakest(fit, result)
         if h["event_s"] > fit["begun_s"] + ADOPT_DELAY_S:
-            slow_fit.estimator.schedule(h["elapsed_s"])  # it is late: adopt it at the next sample
+            slow_fit.estimator.schedule(h["elapsed_s"])  # a late result is adopted at the next sample
         return True
 
     def _handle_event(self, slow_fit: WorkerFit) -> None:
-        """Adopt the received fit, or request a fit if there is no request, or one that was not answered for an interval."""
-        fit, h = self._fit, self._h
+        """Adopt the received fit; or request a fit, unless an unanswered request is younger than the interval between fits."""
+        fit, h = self._fit, self._history
         due_s = fit["begun_s"] + ADOPT_DELAY_S
         if fit["received"]["sequence"]:
             self._adopt(slow_fit)
@@ -159,10 +159,10 @@ class PackFits:
         rows = slow_fit.estimator.take_rows()
         position, identity = RowsPosition(self._sequence, len(self._messages)), f"{self._pack}.{self._sequence}"
         data = encode_rows(Rows(rows, position, self._digest))
-        self._messages.append(HistoryMessage(subjects.history(self._pack), data, f"{identity}.{position.part}"))
+        self._messages.append(QueuedMessage(subjects.history(self._pack), data, f"{identity}.{position.part}"))
         if is_request:
             request = FitRequest(sequence=self._sequence, part=position.part).model_dump_json().encode()
-            self._messages.append(HistoryMessage(subjects.fit_request(self._pack), request, identity))
+            self._messages.append(QueuedMessage(subjects.fit_request(self._pack), request, identity))
 
 
 def write_fit(record: np.void, result: FitResult, sequence: int) -> None:

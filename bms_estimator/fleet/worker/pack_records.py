@@ -92,7 +92,7 @@ class CellPack(NamedTuple):
 
 
 class PackRecords:
-    """Packed records by pack. Each record has this version's layout from the first processed block on.
+    """Packed records by pack. A record gets this version's layout when a block is processed.
 
     Args:
         counters: Counters of the partition; updated.
@@ -162,7 +162,7 @@ class PackRecords:
         return None
 
     def store(self, pack: str) -> None:
-        """Store the unpacked record as that of a pack."""
+        """Store the unpacked record as the record of a pack."""
         packed, cells = self.unpacked.packed_bytes(), self.unpacked.cell_count
         if cells:
             self._cell_packs[pack] = CellPack(cells, packed)

@@ -76,12 +76,12 @@ FLOW = np.dtype(
     ],
     align=True,
 )
-"""Total charge and energy (``telemetry.charge_energy.ChargeEnergy``) and the sums of ``ChargeEnergyMeter``."""
+"""Total charge and energy (``telemetry.lifetime_totals.ChargeEnergy``) and the sums of ``ChargeEnergyMeter``."""
 PACK_FIT = np.dtype(
     [
         # stream sequence number of the message with the fit; 0: none
         ("sequence", "u8"),
-        # std of the filter's SOC from which on the fit is adopted; infinite: never, for example because it failed
+        # minimum std of the filter's SOC at which the fit is adopted; infinite: never, for example because it failed
         ("min_filter_std", "f8"),
         # 1: the pack was exchanged before the fitted rows
         ("is_exchanged", "i8"),
@@ -159,7 +159,7 @@ class UnpackedRecord:
         dtype = pack_dtype(cells) if cells else self._base_dtype
         self.cell_count = cells
         self._words = self._all_words[: dtype.itemsize // WORD_BYTES]
-        # Words below the diagonal of a covariance usually equal their mirror words and are then not stored.
+        # words below the diagonal of a covariance are not stored if they equal their mirror words
         self._symmetric_words = symmetry_map(dtype)
 
     @property
@@ -231,7 +231,7 @@ class UnpackedRecord:
         self.clear()
         copy_known_fields(self.record, other_fields)
         states = self.record["alarms"]["states"]
-        for name in ALARM.names or ():  # an earlier version has the first ones of the alarms
+        for name in ALARM.names or ():  # an earlier version has fewer alarms, in the same order
             saved = other_fields.get(f"alarms.states.{name}", states[name][:, :0])
             if saved.ndim == states.ndim and saved.shape[1] < states.shape[1]:
                 states[name][:, : saved.shape[1]] = saved

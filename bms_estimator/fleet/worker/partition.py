@@ -1,4 +1,4 @@
-"""States of the packs of one partition, updated block by block by the kernel that all commands share.
+"""States of the packs of one partition, updated block by block.
 
 The states depend only on the order of the stream and on the table of packs. From any checkpoint on, equal blocks lead to
 bit-identical states. The module performs no I/O, and uses the clock only for publish times.
@@ -24,7 +24,7 @@ from bms_estimator.fleet.worker.block_order import (
     classify_block,
     density_fault,
     edge_reply,
-    mark_taken,
+    mark_processed,
     position,
 )
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
@@ -34,7 +34,7 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     PartitionCheckpoint,
     read_checkpoint,
 )
-from bms_estimator.fleet.worker.deferred import MAX_UNKNOWN, Deferred
+from bms_estimator.fleet.worker.deferred import MAX_DEFERRED_PACKS, Deferred
 from bms_estimator.fleet.worker.pack_records import PackRecords
 from bms_estimator.fleet.worker.pack_state import Fields
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources, TableInForce
@@ -131,7 +131,7 @@ class Partition:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Counters since the partition was created, over all its workers."""
+        """Counters since the creation of the partition, including those of former workers."""
         return {
             **self._counters,
             "packs": len(self._records),
@@ -157,7 +157,7 @@ class Partition:
         self._records.load(pack)
         return self._records.unpacked.cells.copy()
 
-    def take(
+    def process(
         self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
     ) -> BlockResult:
         """Process a message of the stream, or defer it if its pack is unknown or has other deferred messages.
@@ -182,29 +182,29 @@ class Partition:
         if pack_type is None:
             is_block = not is_fit(data) and isinstance(self._decode(data), Block)
             return self.defer(pack, sequence) if is_block else BlockResult(pack)
-        return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
+        return self._process_fit_or_block(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def defer(self, pack: str, sequence: int) -> BlockResult:
         """Defer a message: it stays in the stream until its pack is served."""
         self.sequence = max(self.sequence, sequence)
-        if pack in self.deferred or len(self.deferred) < MAX_UNKNOWN or self.in_force.is_known(pack):
+        if pack in self.deferred or len(self.deferred) < MAX_DEFERRED_PACKS or self.in_force.is_known(pack):
             self.deferred.add(pack, sequence)
             self._counters["deferred"] += 1
         else:
             self._counters["not_deferred"] += 1
         return BlockResult(pack)
 
-    def take_deferred(
+    def process_deferred(
         self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
     ) -> BlockResult:
-        """Process the next deferred message of a known pack. ``take`` describes the arguments."""
+        """Process the next deferred message of a known pack. ``process`` describes the arguments."""
         pack_type = self.in_force.look_up(pack)
         if pack_type is None or pack not in self.deferred:
             return BlockResult(pack)
         self.deferred.advance(pack, sequence)
         if is_change(data):
             return self._apply_change(pack, data)
-        return self._decode_and_take(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
+        return self._process_fit_or_block(pack, data, Arrival(sequence, received_s), pack_type, is_lethal=is_lethal)
 
     def reject_misplaced(self, pack: str, sequence: int) -> BlockResult:
         """Skip and count a message of a pack that belongs to another partition."""
@@ -240,7 +240,7 @@ class Partition:
                 self._counters["stale_fits"] += 1
         return BlockResult(pack)
 
-    def _decode_and_take(
+    def _process_fit_or_block(
         self, pack: str, data: bytes, arrival: Arrival, pack_type: PackType, *, is_lethal: bool
     ) -> BlockResult:
         """Process a fit or a block of a known pack. Of a lethal block only the header is decoded."""
@@ -250,17 +250,17 @@ class Partition:
         if isinstance(block, BlockError):
             self._log_rejection(pack, str(block))
             return BlockResult(pack, dead_reason=str(block))
-        return self._take(pack, block, arrival, pack_type)
+        return self._process_block(pack, block, arrival, pack_type)
 
     def _decode(self, data: bytes, decode_block: Callable[[bytes], BlockHeader] = decode) -> BlockHeader | BlockError:
-        """Return the block in a message or its header, or the error of a damaged one."""
+        """Return the block in a message, or only its header; if the message is damaged, return the error."""
         try:
             return decode_block(data)
         except BlockError as error:
             self._counters["damaged"] += 1
             return error
 
-    def _take(self, pack: str, block: BlockHeader, arrival: Arrival, pack_type: PackType) -> BlockResult:
+    def _process_block(self, pack: str, block: BlockHeader, arrival: Arrival, pack_type: PackType) -> BlockResult:
         """Process a block of a known pack, or skip a lethal one, of which only the header was decoded."""
         records = self._records
         unmigrated_fields = records.load(pack)
@@ -272,7 +272,7 @@ class Partition:
         newly_lost = int(d["lost_blocks"]) - stored_lost  # since the record was stored
         records.unpacked.count_lost(newly_lost)
         if order is BlockOrder.NEXT:
-            result = self._take_next(pack, block, arrival, pack_type, unmigrated_fields, newly_lost)
+            result = self._process_next(pack, block, arrival, pack_type, unmigrated_fields, newly_lost)
         else:
             result = BlockResult(pack)
             self._counters[order.value] += 1
@@ -286,7 +286,7 @@ class Partition:
         safe = self._unsaved.safe(pack, position(d))
         return result._replace(reply=edge_reply(order, int(d["ahead"]), block, safe, is_first=is_first))
 
-    def _take_next(
+    def _process_next(
         self,
         pack: str,
         block: BlockHeader,
@@ -324,7 +324,7 @@ class Partition:
             classify_block(d, block)
             records.unpacked.count_lost(newly_lost)
             self._counters[skip_counter] += 1
-        mark_taken(d)
+        mark_processed(d)
         self._update_clock_error(pack, float(d["clock_error_s"]))
         return result
 

@@ -62,8 +62,8 @@ class PartitionLease:
         claim: Claim of this worker; None while it has none.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
-        refused_format: Format of the unreadable last checkpoint, because of which the partition is left to other workers;
-            None: the partition is not refused.
+        refused_format: Format of the last checkpoint if this worker cannot read it, and therefore refuses the partition; otherwise
+            None.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class PartitionLease:
         self.trouble, self.checkpoint_due_s = "", 0.0
         self.refused_format: int | None = None
         self._delivered = DeliveredMessages(
-            self.consumer, self._guard, self.results, block_loop, self._process_next_of_stream, self._try
+            self.consumer, self._guard, self.results, block_loop, self._process_next, self._try
         )
         self._silent = False  # the stream must be searched, because no message has arrived
         self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
@@ -156,7 +156,7 @@ class PartitionLease:
             delivered.begin_pass()
             if delivered.pin_lapsed:
                 await self._try(self._check_ownership)
-            await self.consumer.request_taken()
+            await self.consumer.refill()
             if self.consumer.waiting and not delivered.can_process_next():
                 await self._process_delivered(self.consumer.pop())
                 delivered.postpone_search()
@@ -184,15 +184,13 @@ class PartitionLease:
                 and not self.is_checkpoint_too_new
             ):
                 return
-            await (
-                self._confirm_claim()
-            )  # before the snapshot, because a server that has lost its data begins a new stream
+            # before the snapshot, because a server that has lost its data begins a new stream
+            await self._confirm_claim()
             if self.claim is None:
                 return
             claim, snapshot, partition.deferred.is_saved = self.claim, partition.snapshot(), True
             try:
-                # Summaries and dead letters are sent first, because the next owner does not compute those of saved samples
-                # again.
+                # first, because the next owner does not compute the summaries and dead letters of saved samples again
                 await self.results.send_queued()
                 file_format = self._checkpoint_format()
                 self.claim = await self._checkpoints.write(claim, snapshot, file_format=file_format)
@@ -208,7 +206,7 @@ class PartitionLease:
         try:
             await self.save()
             if self.claim:
-                await self._checkpoints.claims.end(self.claim)
+                await self._checkpoints.claims.record_release(self.claim)
         except FencedError as error:
             self._drop_ownership(error)
         except RETRYABLE_ERRORS as error:
@@ -226,11 +224,11 @@ class PartitionLease:
                 reason=error_text(error),
             )
 
-    def settings_changed(self, pack: str) -> None:
+    def on_settings_changed(self, pack: str) -> None:
         """Handle a changed or new row of the table of packs."""
         if self.partition:
             if pack not in self.partition.in_force.rows:  # a row in force changes only by a message of the stream
-                self.partition.in_force.settings_changed(pack)
+                self.partition.in_force.forget_type(pack)
             self._changes.add(pack)
             self._deferred.wake_up()
 
@@ -249,7 +247,7 @@ class PartitionLease:
             async with self._state_lock:
                 partition = await self._take_over()
             self._delivered.pin = delivered.pin
-        # all guarded messages at once, because a request for one of them returns the following ones, too
+        # guarded messages are read together, because a request for one of them also returns the following ones
         self._delivered.is_caught_up = await self._catch_up(
             partition, max(delivered.sequence, self._guard.end_sequence)
         )
@@ -279,7 +277,7 @@ class PartitionLease:
             self._changes.begin(partition.in_force.rows, replay_end)
             self._deferred.wake_up()
         last_sequence = await self._messages.last_of_all_partitions()
-        if self._guard.end_sequence > last_sequence:  # the replay was of a stream that the server has lost since
+        if self._guard.end_sequence > last_sequence:  # the server has since lost the replayed stream
             self._guard.end_sequence = 0
         if partition.sequence > last_sequence:
             log.warning(
@@ -295,7 +293,7 @@ class PartitionLease:
     async def _catch_up(self, partition: Partition, sequence: int) -> bool:
         """Process the stream up to a message. Return False if it ended before, because another worker may own the partition.
 
-        Of each pack, only the newest reply and the newest estimates are published.
+        Only the newest reply and estimates of each pack are published.
         """
         if partition.sequence >= sequence:
             return True
@@ -309,7 +307,7 @@ class PartitionLease:
             await self.results.publish(result)
         return self.partition is partition and not self._delivered.pin_lapsed
 
-    def _process_next_of_stream(self, delivered: DeliveredMessage) -> None:
+    def _process_next(self, delivered: DeliveredMessage) -> None:
         """Process a delivered message whose predecessors are all processed."""
         partition = self.partition
         if partition is not None and delivered.sequence > partition.sequence:
@@ -343,10 +341,10 @@ class PartitionLease:
         self.results.clear()  # the owner of the partition computes them from the last checkpoint on
 
     def _refuse(self, error: UnreadableFormatError) -> None:
-        """Leave the partition to other workers. The worker that holds this lease then releases it."""
+        """Refuse the partition, so that this worker releases the lease, and another worker claims the partition."""
         if self.refused_format is None:
             log.error("partition refused and left to other workers", partition=self.number, reason=str(error))
-        self.refused_format = error.found
+        self.refused_format = error.format
 
     async def _try(self, action: Callable[[], Awaitable[None]]) -> bool:
         """Return True if ``action`` succeeded; log the error if it failed."""

@@ -1,4 +1,4 @@
-"""Tasks of one partition beside its blocks: reading of deferred messages (``deferred``), and sending of table changes to the stream."""
+"""Tasks of one partition: process deferred messages (``deferred``), and send table changes to the stream."""
 
 import asyncio
 from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ from bms_estimator.fleet.worker.pinned_consumer import trusted_data
 
 
 class DeferredReader:
-    """Reader of the deferred messages of one partition.
+    """Task that reads and processes the deferred messages of one partition.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -75,13 +75,15 @@ class DeferredReader:
         if sequence > span.last:  # the stream has dropped the deferred messages
             partition.deferred.advance(pack, span.last)
             return
-        take = partial(partition.take_deferred, received_s=int(message.time.timestamp()) if message.time else None)
+        process_message = partial(
+            partition.process_deferred, received_s=int(message.time.timestamp()) if message.time else None
+        )
         self._runner.count_block(data)
-        await self._results.publish(await self._runner.run(pack, data, sequence, take))
+        await self._results.publish(await self._runner.run(pack, data, sequence, process_message))
 
 
 class TableChangeSender:
-    """Sender of the rows that differ from the ones in force.
+    """Task that sends the rows of the table that differ from the ones in force.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -111,7 +113,7 @@ class TableChangeSender:
         self.wake_up()
 
     def wake_up(self) -> None:
-        """Continue if the replay has ended meanwhile."""
+        """Let ``run`` check again, for example because the replay has ended."""
         self._wake_up.set()
 
     async def run(self) -> None:

@@ -2,7 +2,7 @@
 
 The protocol is ADR-42 of https://github.com/nats-io/nats-architecture-and-design. Measured with nats-server 2.15.1: a pin
 lasts ``streams.PIN_S`` from the last *request* that names it, with or without deliveries. Therefore a request is sent each
-``RENEW_S``. A request expires later than the next one is sent, so that two or three requests are pending. A request
+``RENEW_S``. A request expires only after the next one is sent, so that two or three requests are pending. A request
 without a pin waits while another pin lasts. A request with an expired pin gets status 423.
 """
 
@@ -118,7 +118,7 @@ class DeliveredMessage(NamedTuple):
 
 
 class PinnedConsumer:
-    """Requests messages of a partition and queues them until they are processed.
+    """Consumer that requests messages of a partition, and queues them until they are processed.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -140,7 +140,7 @@ class PinnedConsumer:
         self._pin = ""
         self._pin_count = 0
         self._last_consumer_sequence = -1  # of the last message; initially a value that no message follows
-        self._taken_since_request = 0  # messages taken since the last request
+        self._popped_since_request = 0  # number of messages
 
     @property
     def has_pin(self) -> bool:
@@ -170,13 +170,13 @@ class PinnedConsumer:
 
     def pop(self) -> DeliveredMessage:
         """Return the next queued message. The caller has checked that ``waiting`` is not empty."""
-        self._taken_since_request += 1
+        self._popped_since_request += 1
         return self.waiting.popleft()
 
-    async def request_taken(self) -> None:
-        """Request as many messages as were taken, before the queue is empty."""
-        if self._taken_since_request >= BATCH // 2 and len(self.waiting) < BATCH:
-            await self._request(self._taken_since_request)
+    async def refill(self) -> None:
+        """After half a batch of messages was popped, request as many new ones."""
+        if self._popped_since_request >= BATCH // 2 and len(self.waiting) < BATCH:
+            await self._request(self._popped_since_request)
 
     def receive(self, message: Msg) -> bool:
         """Process a message or status from the server. Return True if the status ends this worker's pin."""
@@ -208,7 +208,7 @@ class PinnedConsumer:
         request: dict[str, str | int] = {"batch": batch, "expires": round(1e9 * EXPIRES_S), "group": PRIORITY_GROUP}
         if self._pin:
             request["id"] = self._pin
-        self._taken_since_request = 0
+        self._popped_since_request = 0
         await self._nc.publish(self._next_subject, json.dumps(request).encode(), f"{self._inbox}.{self._pin_count}")
 
     def _queue_message(self, message: Msg, pin: str) -> None:

@@ -68,7 +68,7 @@ class TableInForce:
         """Return True if the pack has valid settings."""
         return self._settings(pack) is not None
 
-    def settings_changed(self, pack: str) -> None:
+    def forget_type(self, pack: str) -> None:
         """Drop the cached type of a pack, so that its next block looks it up again."""
         self._type_by_pack.pop(pack, None)
 
@@ -90,7 +90,7 @@ class TableInForce:
             self._rows.pop(pack, None)
         else:
             self._rows[pack] = source
-        self.settings_changed(pack)
+        self.forget_type(pack)
 
     def _settings(self, pack: str) -> tuple[Settings, PackModel] | None:
         """Return the settings and the model in force. For a new pack, and for a row with an error, the table is read."""

@@ -21,13 +21,13 @@ GUARDED_CLAIMS = 2
 """Number of claims since the last checkpoint from which a replay is guarded. The replay after the first claim is not guarded,
 because a guarded replay waits for the server at each block, and most workers do not die because of a block."""
 MAX_DEATHS = 2
-"""Number of owners that must die while they process the same block in a guarded replay, until the block is lethal."""
+"""Number of owners that must die while they process the same block in a guarded replay, before the block counts as lethal."""
 MAX_SUSPECTS = 16
 """Maximum number of blocks for which deaths are counted. The newest blocks are kept."""
 
 
 class ReplayGuard:
-    """Guard of one partition.
+    """Guard of the replay of one partition against blocks that kill workers.
 
     Args:
         records: Records of the replays.
@@ -109,7 +109,7 @@ async def restore_partition(
         async for checkpoint, data in loaded:
             try:
                 partition = Partition.restore(number, table, data, sources=sources)
-            except UnreadableFormatError:  # an earlier checkpoint, or none, would lose what was learned
+            except UnreadableFormatError:  # with an earlier checkpoint or none, learned parameters would be lost
                 raise
             except ValueError as error:
                 log.warning(

@@ -71,7 +71,7 @@ once."""
 CHECK_S = 0.5
 """Interval between two checks for a due checkpoint or waiting summaries [s]."""
 REFUSAL_CHECK_S = 10.0
-"""Interval between two checks whether the checkpoint of a refused partition has become readable [s]."""
+"""Poll interval for a readable checkpoint of a refused partition [s]."""
 UNSAVED_CHECK_S = 30.0
 """Interval between two runs of ``UnsavedCheck`` [s]."""
 
@@ -142,7 +142,7 @@ def _raise_if_closed(nc: Client, options: Options) -> None:
 
 
 class Worker:
-    """Worker process with its partitions.
+    """Worker process, and the leases of its partitions.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -252,7 +252,7 @@ class Worker:
         now_s = time.monotonic()
         # without a connection no heartbeat arrives, and while the event loop was blocked none was read
         if not self._nc.is_connected or now_s > self._leases_updated_s + DEAD_S / 2.0:
-            self._members.extend_all(now_s)
+            self._members.extend_deadlines(now_s)
         self._leases_updated_s = now_s
         await self._refuse_unreadable()
         share = self._members.share(self._partitions, now_s)
@@ -274,13 +274,13 @@ class Worker:
             await self._send_heartbeat()
 
     async def _check_refused(self) -> None:
-        """Accept the refused partitions whose checkpoints another worker has written in a readable format since."""
+        """Stop refusing the partitions whose last checkpoints another worker has since written in a readable format."""
         refused = self._members.refused
         for number in refused.keys() - self._lease_tasks.numbers if self._nc.is_connected else ():
             try:
                 await self._checkpoints.claims.check_format(number)
             except UnreadableFormatError as error:
-                refused[number] = error.found
+                refused[number] = error.format
             except RETRYABLE_ERRORS as error:
                 log.warning("a refused partition cannot be checked", partition=number, reason=error_text(error))
             else:
@@ -314,7 +314,7 @@ class Worker:
             for pack in await self._changed_packs.get():
                 lease = self._lease_tasks.get(subjects.partition_of(pack, self._partitions))
                 if lease:
-                    lease.settings_changed(pack)
+                    lease.on_settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
         lease_trouble = next((lease.trouble for lease in self._leases if lease.trouble), "")

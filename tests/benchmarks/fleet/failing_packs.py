@@ -120,7 +120,7 @@ def rows_of_pack(chemistry: str, variant: str, days: int = DAYS, seed: int = 0) 
         samples = history.samples(rng, 2e-3, 0.01)
         arrival_s = STORE_NS / 1e9 + float(samples["time_s"][-1])
         data = encode(Block(STORE_NS, number, 1, arrival_s, samples, cells_v))
-        for _, row in partition.take(name, data, number, round(arrival_s)).hours:
+        for _, row in partition.process(name, data, number, round(arrival_s)).hours:
             yield Hour.model_validate_json(row)
 
 

@@ -93,7 +93,7 @@ def _block_us(partition: Partition, blocks: list[bytes]) -> float:
         begin_s = time.process_time()
         for pack in range(PACKS):
             sequence += 1
-            partition.take(f"pack{pack}", data, sequence)
+            partition.process(f"pack{pack}", data, sequence)
         minutes_s.append(time.process_time() - begin_s)
     median_s = np.median(minutes_s[1:])
     # The first block after the full hour also completes the summary of the hour.

@@ -85,7 +85,7 @@ async def test_worker_that_is_killed_between_a_fit_and_its_adoption_changes_no_b
     undisturbed, ended = Partition(0, registry), (await end_states(nc, registry, 1))[0]
     for message in await stored(nc, subjects.RAW_STREAM, subjects.stored(0)):
         if message.sequence <= ended.sequence:  # ``fleet fit`` still runs
-            undisturbed.take(PACK, message.data, message.sequence)
+            undisturbed.process(PACK, message.data, message.sequence)
     state, expected = ended.state(PACK), undisturbed.state(PACK)
     assert expected["fit"]["in_force"]["sequence"][0] > 0
     assert state["fit"].tobytes() == expected["fit"].tobytes()

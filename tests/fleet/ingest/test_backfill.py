@@ -66,7 +66,7 @@ async def test_backfill_waits_for_confirmations(
     await load_packs(nc, ["p1"])
     write(tmp_path / "p1.parquet", samples_of("p1", 240))
     write(tmp_path / "ghost.parquet", samples_of("p2", 7))
-    values = {"MAX_UNCONFIRMED_OF_PACK": 15, "PART_SAMPLES": 6, "SAVE_SAMPLES": 6, "REQUEST_S": 0.1, "WAIT_S": 0.05}
+    values = {"MAX_UNCONFIRMED_OF_PACK": 15, "MAX_PART_SAMPLES": 6, "SAVE_SAMPLES": 6, "REQUEST_S": 0.1, "WAIT_S": 0.05}
     for name, value in values.items():
         monkeypatch.setattr(backfill_module, name, value)
     blocks = await nc.subscribe("raw.p1")

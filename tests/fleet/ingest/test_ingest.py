@@ -267,7 +267,7 @@ async def test_other_tasks_run_between_the_parts_of_a_batch(
         return add(*arguments)
 
     monkeypatch.setattr(IngestStore, "add", counted_add)
-    monkeypatch.setattr(ingest_module, "PART_SAMPLES", 10)
+    monkeypatch.setattr(ingest_module, "MAX_PART_SAMPLES", 10)
     async with ingesting(tmp_path, cluster.url):
         await send(nc, "p1", json_batch(samples_of("p1", 60)))
         while len(iterations) < 6:

@@ -36,7 +36,7 @@ def test_batch_that_cannot_be_encoded_changes_nothing() -> None:
         for each in (blocks, expected):
             each.add("p1", batch(part), NOW_S, 0.0, sequence)
     for each in (blocks, expected):
-        each.cut()
+        each.complete()
     assert blocks.completed == expected.completed
     assert blocks.changed == expected.changed
 
@@ -46,7 +46,7 @@ def test_open_block_that_cannot_be_encoded_is_dropped_and_named() -> None:
     for pack, cells in {"p1": 300, "p2": 16}.items():
         blocks.add(pack, batch(ROWS[:5], cells), NOW_S, 0.0, 1)
     with capture_logs() as lines:
-        blocks.cut()
+        blocks.complete()
     assert [line["pack"] for line in lines] == ["p1"]
     assert [block.pack for block in blocks.completed] == ["p2"]
     assert blocks.first_sequence(7) == 7

@@ -92,6 +92,6 @@ async def test_replay_of_captured_cell_voltages_gives_the_states_of_the_worker_b
         cells.run(received.samples, received.cells_v, estimator.run(received.samples))
     partition = Partition(0, table)
     for sequence, data in enumerate(CELL_BLOCKS, 1):
-        partition.take("cells", data, sequence)
+        partition.process("cells", data, sequence)
     assert partition.cells("cells").tobytes() == cells.cells.tobytes()
     assert estimates_of(partition.state("cells")["estimator"]) == estimates_of(estimator.record)

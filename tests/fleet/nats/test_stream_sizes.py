@@ -54,7 +54,7 @@ async def test_stored_day_of_a_pack_is_at_most_as_large_as_computed(tmp_path: Pa
             numbers = np.full(PACKS, number)
             for i, data in enumerate(fleet.blocks(np.arange(PACKS), numbers, begin_s + numbers * BLOCK_S)):
                 await nc.publish(subjects.raw(fleet.names[i]), data)
-                for message_id, hour in partition.take(fleet.names[i], data, partition.sequence + 1).hours:
+                for message_id, hour in partition.process(fleet.names[i], data, partition.sequence + 1).hours:
                     headers = {"Nats-Msg-Id": message_id}
                     await js.publish(subjects.hours(fleet.names[i]), hour, headers=headers)
             if number % 60 == 0:
@@ -87,8 +87,8 @@ def test_block_hour_and_state_with_cell_voltages_are_at_most_as_large_as_compute
         samples = history.samples(rng, 2e-3, 1e-2)
         block = Block(store_ns, number, 1, store_ns / 1e9 + 60.0 * number, samples, cells_v)
         data, without_cells = encode(block), encode(replace(block, cells_v=NO_CELLS))
-        hours += partition.take("with", data, 2 * number - 1).hours
-        partition.take("without", without_cells, 2 * number)
+        hours += partition.process("with", data, 2 * number - 1).hours
+        partition.process("without", without_cells, 2 * number)
         sizes.append(len(data))
         additional.append(len(data) - len(without_cells))
     snapshot = partition.snapshot()

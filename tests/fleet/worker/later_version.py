@@ -25,7 +25,7 @@ def set_format(newest: int, set_attribute: Callable[[object, str, object], None]
         upgrade=lambda header: count(header, UPGRADED), downgrade=lambda header: count(header, DOWNGRADED)
     )
     set_attribute(checkpoint_format, "FORMAT", newest)
-    set_attribute(checkpoint_format, "PREVIOUS", migration)
+    set_attribute(checkpoint_format, "MIGRATION", migration)
 
 
 if __name__ == "__main__":

@@ -90,7 +90,7 @@ def row_of_an_hour(partition, ahead_s):
     """Send two blocks whose edge is ``ahead_s`` ahead of the server, and return the row of the finished hour."""
     for number, last_s in enumerate((3000.0, 4000.0), 1):
         received_s = round(STORE_S + last_s - ahead_s)
-        result = partition.take("a", one_block(samples_until(last_s), number), number, received_s)
+        result = partition.process("a", one_block(samples_until(last_s), number), number, received_s)
     ((_, data),) = result.hours
     return Hour.model_validate_json(data)
 
@@ -113,7 +113,7 @@ def test_lethal_block_of_an_edge_with_a_wrong_clock_is_skipped_and_the_hour_is_q
     hours, dead = [], []
     for number, last_s in enumerate((2000.0, 3000.0, 3500.0, 4000.0), 1):
         data, received_s = one_block(samples_until(last_s), number), round(STORE_S + last_s - ahead_s)
-        result = partition.take("a", data, number, received_s, is_lethal=number == lethal)
+        result = partition.process("a", data, number, received_s, is_lethal=number == lethal)
         hours += result.hours
         dead += [number] if result.dead_reason else []
     ((_, row),) = hours
@@ -135,7 +135,7 @@ def test_hour_with_one_block_from_the_future_is_quarantined_and_the_following_ho
     rows = []
     for number, (last_s, ahead_s) in enumerate([(1000.0, 7200.0), (2000.0, 0.0), (4000.0, 0.0), (8000.0, 0.0)], 1):
         received_s = round(STORE_S + last_s - ahead_s)
-        result = partition.take("a", one_block(samples_until(last_s), number), number, received_s)
+        result = partition.process("a", one_block(samples_until(last_s), number), number, received_s)
         rows += [Hour.model_validate_json(data) for _, data in result.hours]
     assert [row.clock_error_s for row in rows] == [7200.0, None]
     assert partition.clock_errors == {}
@@ -156,7 +156,9 @@ def test_new_store_of_an_edge_whose_clock_steps_back_by_days_has_its_own_hours()
     for sequence, (store, number, last_s) in enumerate(blocks, 1):
         received_s = round(stores_s[store] + last_s + (behind_s if store == "new" else 0))
         block = one_block(samples_until(last_s), number, stores_s[store] * 10**9)
-        rows += [Hour.model_validate_json(data) for _, data in partition.take("a", block, sequence, received_s).hours]
+        rows += [
+            Hour.model_validate_json(data) for _, data in partition.process("a", block, sequence, received_s).hours
+        ]
     first, last, behind = (int(STORE_S + s) // 3600 for s in (3000.0, days_later_s - 3700.0, days_later_s - behind_s))
     assert [(row.hour, row.samples) for row in rows] == [(first, 60), (last, 60), (behind, 120)]
     assert (partition.clock_errors, partition.counters.get("former_store", 0)) == ({}, 0)
@@ -164,16 +166,16 @@ def test_new_store_of_an_edge_whose_clock_steps_back_by_days_has_its_own_hours()
 
 def test_clock_error_of_an_unfinished_hour_survives_a_takeover():
     partition = Partition(0, table)
-    partition.take("a", one_block(samples_until(1000.0), 1), 1, round(STORE_S + 1000.0 - 7200.0))
+    partition.process("a", one_block(samples_until(1000.0), 1), 1, round(STORE_S + 1000.0 - 7200.0))
     restored = Partition.restore(0, table, b"".join(partition.snapshot().chunks()))
-    ((_, data),) = restored.take("a", one_block(samples_until(4000.0), 2), 2, STORE_S + 4000).hours
+    ((_, data),) = restored.process("a", one_block(samples_until(4000.0), 2), 2, STORE_S + 4000).hours
     assert Hour.model_validate_json(data).clock_error_s == 7200.0
 
 
 def test_revision_of_a_row_is_the_sequence_of_the_block_that_finished_it():
     partition = Partition(0, table)
-    partition.take("a", one_block(samples_until(3000.0), 1), 7)
-    ((message_id, data),) = partition.take("a", one_block(samples_until(4000.0), 2), 9).hours
+    partition.process("a", one_block(samples_until(3000.0), 1), 7)
+    ((message_id, data),) = partition.process("a", one_block(samples_until(4000.0), 2), 9).hours
     assert Hour.model_validate_json(data).revision == 9
     assert message_id.endswith(".9")
 

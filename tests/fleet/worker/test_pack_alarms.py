@@ -104,7 +104,7 @@ class Worker:
 
     def send(self, block, *, take_over=False):
         """Process a block. Return the states of the alarms by name."""
-        self.results.append(self.partition.take(PACK, encode(block), self.partition.sequence + 1))
+        self.results.append(self.partition.process(PACK, encode(block), self.partition.sequence + 1))
         if take_over:
             data = b"".join(self.partition.snapshot().chunks())
             self.partition = Partition.restore(0, table, data, wall=lambda: 0.0)

@@ -123,7 +123,7 @@ def test_any_order_of_blocks_and_any_earlier_snapshot_give_the_same_state(steps,
     snapshot = data.draw(st.sampled_from(snapshots))
     restored = Partition.restore(5, table, b"".join(snapshot.chunks()))
     for sequence, (pack, message) in enumerate(stream.messages, 1):
-        restored.take(pack, message, sequence)
+        restored.process(pack, message, sequence)
     counters = dict(restored.counters)
     assert counters.pop("repeated", 0) == snapshot.sequence  # messages that the snapshot already includes
     assert counters == stream.partition.counters
@@ -144,8 +144,8 @@ def test_snapshot_does_not_change_with_later_blocks(stream, samples) -> None:
 def test_processed_message_is_not_processed_again(samples) -> None:
     partition, sequence = Partition(0, table), 7
     data = one_block(samples[:20], 1)
-    assert partition.take("a", data, sequence).state
-    assert partition.take("a", data, sequence).state is None
+    assert partition.process("a", data, sequence).state
+    assert partition.process("a", data, sequence).state is None
     assert partition.sequence == sequence
     assert partition.counters["repeated"] == 1
 
@@ -367,9 +367,9 @@ class TestUnknownPack:
             assert (result.state, result.reply) == (None, None)
             stream.take_over()
         assert stream.partition.unknown == ("a",)
-        assert stream.take_deferred() == []
+        assert stream.process_deferred() == []
         packs["a"] = SETTINGS, CELL
-        assert [bool(each.state) for each in stream.take_deferred()] == 10 * [True]
+        assert [bool(each.state) for each in stream.process_deferred()] == 10 * [True]
         assert stream.partition.unknown == ()
         deliver(stream, "a", blocks)
         assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
@@ -382,11 +382,11 @@ class TestUnknownPack:
             stream.send("a", data)
         packs["a"] = SETTINGS, CELL
         stream.send("a", blocks[-1])
-        assert stream.take_deferred()[-1].reply.number == 1
+        assert stream.process_deferred()[-1].reply.number == 1
         assert_state_equals(stream, "a", record_of_one_run(samples[:200]))
 
     def test_number_of_deferred_packs_is_limited(self, monkeypatch: pytest.MonkeyPatch, samples) -> None:
-        monkeypatch.setattr(partition_module, "MAX_UNKNOWN", 3)
+        monkeypatch.setattr(partition_module, "MAX_DEFERRED_PACKS", 3)
         packs = {}
         stream = Stream(Partition(5, packs.get))
         data = one_block(samples[:20], 1)
@@ -408,13 +408,13 @@ class TestDeferredPack:
         blocks, stream, number = blocks_of(rows, size=30), Stream(Partition(5, table)), 0
         for step in steps:
             if step == "take deferred":
-                stream.take_deferred(max_messages=1)
+                stream.process_deferred(max_messages=1)
             elif step == "take over":
                 stream.take_over()
             elif number < len(blocks):
                 stream.send("a", blocks[number], defer=step == "defer")
                 number += 1
-        stream.take_deferred()
+        stream.process_deferred()
         for data in blocks[number:]:
             stream.send("a", data)
         assert_state_equals(stream, "a", record_of_one_run(rows))
@@ -428,7 +428,7 @@ class TestDeferredPack:
         for pack, data in [("a", data) for data in blocks[:10]] + [("b", data) for data in blocks_of_b[:10]]:
             stream.send(pack, data, defer=True)
         stream.take_over()
-        assert [result.pack for result in stream.take_deferred()] == 10 * ["a", "b"]
+        assert [result.pack for result in stream.process_deferred()] == 10 * ["a", "b"]
         stream.take_over()
         deliver(stream, "a", blocks[10:], first=11)
         deliver(stream, "b", blocks_of_b[10:], first=11)
@@ -452,7 +452,7 @@ class TestChangedSettings:
         self.send_blocks(stream, samples, 0, 20)
         other_cell = load_cell("ncr18650", 4.0)  # a capacity of 4 Ah
         packs["a"] = SETTINGS, other_cell
-        stream.partition.in_force.settings_changed("a")
+        stream.partition.in_force.forget_type("a")
         self.send_blocks(stream, samples, 20, 30)
         estimator = make_estimator(SETTINGS, other_cell)
         estimator.run(samples[400:600])
@@ -470,7 +470,7 @@ class TestChangedSettings:
         if is_taken_over:  # a new owner reads the new settings at once
             stream.take_over()
         else:
-            stream.partition.in_force.settings_changed("a")
+            stream.partition.in_force.forget_type("a")
         stream.send("a", blocks_of(samples)[3])  # it was processed before, and migrates nothing
         result = self.send_blocks(stream, samples, 20, 21)
         state = Estimate.model_validate_json(result.state)
@@ -485,11 +485,11 @@ class TestChangedSettings:
         stream = Stream(Partition(5, packs.get))
         self.send_blocks(stream, samples, 0, 10)
         row = packs.pop("a")
-        stream.partition.in_force.settings_changed("a")
+        stream.partition.in_force.forget_type("a")
         assert self.send_blocks(stream, samples, 10, 20).state is None
         packs["a"] = row
-        stream.partition.in_force.settings_changed("a")
-        assert len(stream.take_deferred()) == 10
+        stream.partition.in_force.forget_type("a")
+        assert len(stream.process_deferred()) == 10
         assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
 
 

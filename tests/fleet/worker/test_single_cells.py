@@ -70,7 +70,7 @@ def run(partition, blocks, *, take_over=False):
     for row in zip(*blocks.values(), strict=True):
         for pack, block in zip(blocks, row, strict=True):
             sequence += 1
-            results.append(partition.take(pack, encode(block), sequence))
+            results.append(partition.process(pack, encode(block), sequence))
         if take_over:
             partition = restored(partition)
     return partition, results
@@ -152,7 +152,7 @@ def test_state_agrees_in_every_field_with_that_of_a_replay(blocks):
 def test_state_has_the_last_known_cell_voltages_of_a_block():
     (block,) = minutes(1, 1)
     block.cells_v[-1] = math.nan
-    result = Partition(0, table).take("a", encode(block), 1)
+    result = Partition(0, table).process("a", encode(block), 1)
     assert json.loads(result.state)["cells_v"] == block.cells_v[-2].tolist()
 
 
@@ -204,13 +204,13 @@ def test_earlier_version_drops_the_cells_and_keeps_the_estimator(blocks, monkeyp
         earlier.setattr(CellEstimator, "estimated_cells", 0)
         older = restored(partition)
         for number, pack in enumerate(PACKS, 1 + partition.sequence):
-            older.take(pack, encode(last[pack][0]), number)
+            older.process(pack, encode(last[pack][0]), number)
         data = b"".join(older.snapshot().chunks())
     assert older.snapshot().other_layouts == {}
     partition = Partition.restore(0, table, data)
     for offset in range(1, 10):
         for pack in PACKS:
-            partition.take(pack, encode(last[pack][offset]), partition.sequence + 1)
+            partition.process(pack, encode(last[pack][offset]), partition.sequence + 1)
     for pack in PACKS:
         estimator, _ = replayed(blocks[pack])
         assert estimates_of(partition.state(pack)["estimator"]) == estimates_of(estimator.record)
@@ -224,7 +224,7 @@ def test_later_version_with_other_fields_keeps_the_cells(blocks, monkeypatch):
     assert set(later.snapshot().other_layouts) == set(PACKS)
     before = {pack: partition.cells(pack).tobytes() for pack in PACKS}
     for pack in PACKS:  # a repeated block migrates the record
-        later.take(pack, encode(blocks[pack][-1]), later.sequence + 1)
+        later.process(pack, encode(blocks[pack][-1]), later.sequence + 1)
         assert later.cells(pack).tobytes() == before[pack]
 
 
@@ -238,7 +238,7 @@ def test_cells_are_kept_with_another_tuning_and_begin_anew_with_another_capacity
     stds = []
     for entry in ((tuned, MODEL), (SETTINGS, larger)):
         partition = Partition.restore(0, lambda _, entry=entry: entry, data)
-        partition.take("b", encode(block), partition.sequence + 1)
+        partition.process("b", encode(block), partition.sequence + 1)
         stds.append(partition.cells("b")["covariance"][0, 0, 0])
     assert stds[0] < 1.5 * windows_before[0, 0, 0] < stds[1]
 
@@ -251,7 +251,7 @@ def test_gap_at_a_new_store_counts_as_a_gap_of_the_cells(blocks):
     block = replace(blocks["b"][0], store_created_ns=new_store, arrival_s=new_store / 1e9 + 60.0)
     block = replace(block, samples=block.samples.copy())
     block.samples["time_s"] -= block.samples["time_s"][0]
-    partition.take("b", encode(block), partition.sequence + 1)
+    partition.process("b", encode(block), partition.sequence + 1)
     estimator, cells = replayed(blocks["b"][:20])
     estimator.resume(gap_s)
     cells.resume(gap_s)

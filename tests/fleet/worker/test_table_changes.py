@@ -49,7 +49,7 @@ def messages() -> list[bytes]:
     """Return two blocks, a change of the row, and a block."""
     registry = registry_of(PACK_ROW)
     partition = partition_of(registry)
-    partition.take("p1", block("p1", 1), 1)
+    partition.process("p1", block("p1", 1), 1)
     registry.set_row("p1", CHANGED_ROW)
     change = partition.in_force.table_change("p1")
     assert change is not None
@@ -62,7 +62,7 @@ def expected(messages: list[bytes]) -> bytes:
     registry = registry_of(PACK_ROW)
     partition = partition_of(registry)
     for sequence, message in enumerate(messages, 1):
-        partition.take("p1", message, sequence)
+        partition.process("p1", message, sequence)
     return estimator_state(partition)
 
 
@@ -72,10 +72,10 @@ def test_state_after_a_takeover_does_not_depend_on_the_present_table(
 ) -> None:
     partition = partition_of(registry_of(PACK_ROW))
     for sequence, message in enumerate(messages[:taken_over_after], 1):
-        partition.take("p1", message, sequence)
+        partition.process("p1", message, sequence)
     successor = partition_of(registry_of(CHANGED_ROW), b"".join(partition.snapshot().chunks()))
     for sequence, message in enumerate(messages[taken_over_after:], taken_over_after + 1):
-        successor.take("p1", message, sequence)
+        successor.process("p1", message, sequence)
     assert estimator_state(successor) == expected
     assert successor.counters["table_changes"] == 1
 
@@ -83,10 +83,10 @@ def test_state_after_a_takeover_does_not_depend_on_the_present_table(
 def test_changed_row_takes_effect_at_its_message_and_not_before(messages: list[bytes], expected: bytes) -> None:
     registry = registry_of(PACK_ROW)
     partition = partition_of(registry)
-    partition.take("p1", messages[0], 1)
+    partition.process("p1", messages[0], 1)
     registry.set_row("p1", CHANGED_ROW)
     for sequence, message in enumerate(messages[1:], 2):
-        partition.take("p1", message, sequence)
+        partition.process("p1", message, sequence)
     assert estimator_state(partition) == expected
     assert partition.in_force.table_change("p1") is None  # it is in force
 
@@ -99,10 +99,10 @@ def test_change_between_deferred_blocks_takes_effect_between_them(
     for sequence in range(1, len(messages) + 1):
         partition.defer("p1", sequence)
     for sequence, message in enumerate(messages[:saved_after], 1):
-        partition.take_deferred("p1", message, sequence)
+        partition.process_deferred("p1", message, sequence)
     successor = partition_of(registry_of(CHANGED_ROW), b"".join(partition.snapshot().chunks()))
     for sequence, message in enumerate(messages[saved_after:], saved_after + 1):
-        successor.take_deferred("p1", message, sequence)
+        successor.process_deferred("p1", message, sequence)
     assert estimator_state(successor) == expected
     assert not successor.deferred
 
@@ -110,21 +110,21 @@ def test_change_between_deferred_blocks_takes_effect_between_them(
 def test_removed_pack_is_unknown_from_its_message_on() -> None:
     registry = registry_of(PACK_ROW)
     partition = partition_of(registry)
-    partition.take("p1", block("p1", 1), 1)
+    partition.process("p1", block("p1", 1), 1)
     registry.set_row("p1", None)
     change = partition.in_force.table_change("p1")
     assert change is not None
     assert decode_change(change) is None
     assert partition.in_force.is_known("p1")
-    partition.take("p1", change, 2)
-    partition.take("p1", block("p1", 2), 3)
+    partition.process("p1", change, 2)
+    partition.process("p1", block("p1", 2), 3)
     assert partition.unknown == ("p1",)
 
 
 @pytest.mark.parametrize("damaged", [b"BMST", b"BMST{", b'BMST{"row": 1}', b"BMST[]"])
 def test_damaged_change_is_counted_and_skipped(damaged: bytes) -> None:
     partition = partition_of(registry_of(PACK_ROW))
-    partition.take("p1", damaged, 1)
+    partition.process("p1", damaged, 1)
     assert (partition.sequence, partition.counters["damaged"]) == (1, 1)
 
 
@@ -152,7 +152,7 @@ async def test_successor_of_a_killed_worker_applies_a_changed_row_between_the_sa
     registry = registry_of(PACK_ROW)
     reference = partition_of(registry)
     for sequence in range(1, BLOCKS + 2):
-        reference.take("p1", await message_of(nc, sequence), sequence)
+        reference.process("p1", await message_of(nc, sequence), sequence)
     restored = (await end_states(nc, registry, 1))[0]
     assert estimator_state(restored) == estimator_state(reference)
     assert restored.counters["table_changes"] == 1

@@ -63,7 +63,7 @@ async def test_replay_is_not_guarded(store: CheckpointStore, is_saved: bool) -> 
     if is_saved:
         await store.write(claim, raw(1, b"1"), file_format=FORMAT)
     else:
-        await store.claims.end(claim)
+        await store.claims.record_release(claim)
     guard = await claim_after_a_death(store)
     assert not await guard.is_lethal(5)
     assert (await store.replays.read(0)).sequence == 0

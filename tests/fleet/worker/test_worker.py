@@ -195,7 +195,7 @@ async def run_over_the_stream(
             for message in batch:
                 _, number, _, pack = message.subject.split(".")
                 if message.sequence <= states[int(number)].sequence:
-                    for _, row in partitions[int(number)].take(pack, message.data, message.sequence).hours:
+                    for _, row in partitions[int(number)].process(pack, message.data, message.sequence).hours:
                         rows |= without_arrival(row)
     return partitions, rows
 

@@ -1,4 +1,4 @@
-"""Changes of checkpoints by an administrator: return of partitions to an earlier day, and erasure of packs from the server.
+"""Changes of checkpoints by an administrator: restoration of an earlier day, and erasure of packs from the server.
 
 Each change claims the partition as a worker does. The owner is thereby fenced out, drops the partition from its memory, and takes it
 over again from the changed checkpoints. An erasure covers blocks, dead letters, states in checkpoints and in the memory of workers,
@@ -38,7 +38,7 @@ RESTORE_NAME, ERASE_NAME = "checkpoints-restore", "packs-remove"
 """Names with which the commands claim partitions."""
 MAX_CLAIMS = 20
 """Maximum number of claims of a partition, because its worker may claim it again before its checkpoints are changed."""
-TABLE_S = 3.0 * POLL_S
+TABLE_REFRESH_S = 3.0 * POLL_S
 """Waiting time until all workers have removed a pack from their copies of the table [s]."""
 MAX_TOKENS = 5
 """Maximum position of a pack's name in a subject [tokens]."""
@@ -188,14 +188,14 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
     listed = packs & (await read_bucket(nc, subjects.PACKS_BUCKET)).keys()
     if listed:
         await remove_keys(nc, subjects.PACKS_BUCKET, listed)
-        await asyncio.sleep(TABLE_S)  # otherwise a worker may process a new block with the former settings
+        await asyncio.sleep(TABLE_REFRESH_S)  # otherwise a worker may process a new block with the former settings
     blocks, checkpoints = dict[str, int](), dict[str, int]()
     for number in numbers:
-        members = {pack for pack in packs if subjects.partition_of(pack, partitions) == number}
-        for pack in members:
+        packs_of_partition = {pack for pack in packs if subjects.partition_of(pack, partitions) == number}
+        for pack in packs_of_partition:
             blocks[pack] = await erase_messages(nc, subjects.RAW_STREAM, subjects.stored_raw(number, pack))
             await erase_messages(nc, subjects.RAW_STREAM, subjects.stored(number, pack))  # changes of its row, fits
-        checkpoints |= await _erase_states(nc, store, number, members)
+        checkpoints |= await _erase_states(nc, store, number, packs_of_partition)
     dead_letters = {pack: await erase_messages(nc, subjects.DEAD_STREAM, subjects.dead(pack)) for pack in packs}
     hours = {pack: await erase_messages(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
     for pack in packs:
@@ -251,7 +251,7 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
         try:
             checkpoint = read_checkpoint(data)
         except UnreadableFormatError:
-            if not readable:  # its removal would lose what was learned
+            if not readable:  # its removal would lose the learned parameters
                 raise
             continue
         except CheckpointError:
@@ -259,14 +259,14 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
         readable.add(info)
         by_pack = _fields_by_pack(checkpoint)
         found = {pack for pack in counts if any(pack in part for part in by_pack.values())}
-        if found or store.is_damaged(info):  # the content of a damaged increment is unknown
+        if found or store.is_damaged(info):  # a damaged increment may contain the packs
             parts: dict[str, Any] = {name: _without(part, found) for name, part in by_pack.items()}
             rest = replace(checkpoint, **parts)
             claim = await store.replace(claim, info, rest.chunks(info.format))
         for pack in found:
             counts[pack] += 1
     for info in checkpoints:
-        if info not in readable:  # its content is unknown
+        if info not in readable:  # it may contain the packs
             claim = await store.replace(claim, info, None)
 
 
@@ -301,9 +301,10 @@ async def _count_messages(nc: Client, stream: str, pack: str) -> int:
 
 
 def _pack_subjects(stream: str, pack: str) -> list[str]:
-    """Return the subjects of a stream with a pack's name, with wildcards; for a stream of another program at any position.
+    """Return patterns of the subjects of a stream that contain a pack's name.
 
-    In the other streams of the fleet, a pack's name may also be that of a partition, such as ``p0``.
+    In a stream of another program, the name may be at any position. In a stream of the fleet, only the position of the pack's
+    name counts, because a pack may be named like a partition, such as ``p0``.
     """
     fleet_subjects = {
         subjects.RAW_STREAM: [f"p.*.*.{pack}"],

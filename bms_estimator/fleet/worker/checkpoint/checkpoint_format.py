@@ -72,7 +72,7 @@ def _with_increments(header: Header) -> Header:
     return header | {"increment": 0}
 
 
-PREVIOUS: HeaderMigration | None = HeaderMigration(upgrade=_with_increments, downgrade=_without_increments)
+MIGRATION: HeaderMigration | None = HeaderMigration(upgrade=_with_increments, downgrade=_without_increments)
 """Migration between format ``FORMAT - 1`` and ``FORMAT``; None while ``FORMAT`` is the first format."""
 
 
@@ -86,17 +86,17 @@ class UnreadableFormatError(CheckpointError):
     def __init__(self, found: int) -> None:
         what = f"the checkpoint is of format {found}" if found else "the pointer to the checkpoints is unreadable"
         super().__init__(f"{what}, this version reads {readable_text()}: start a worker of the version that wrote it")
-        self.found = found
+        self.format = found
 
 
 def oldest_format() -> int:
     """Return the oldest format that this version reads and writes."""
-    return FORMAT if PREVIOUS is None else FORMAT - 1
+    return FORMAT if MIGRATION is None else FORMAT - 1
 
 
 def readable_text() -> str:
     """Return the readable formats as text, such as ``1 and 2``."""
-    return f"{FORMAT}" if PREVIOUS is None else f"{FORMAT - 1} and {FORMAT}"
+    return f"{FORMAT}" if MIGRATION is None else f"{FORMAT - 1} and {FORMAT}"
 
 
 def is_readable(found: int) -> bool:
@@ -105,7 +105,7 @@ def is_readable(found: int) -> bool:
 
 
 def common_format(newest_formats: Iterable[int]) -> int:
-    """Return the format to write: the newest one that all workers read, as far as this version writes it.
+    """Return the newest format that this version writes and all live workers read.
 
     Args:
         newest_formats: Newest format that each other worker reads.
@@ -115,12 +115,12 @@ def common_format(newest_formats: Iterable[int]) -> int:
 
 def upgrade(header: Header, file_format: int) -> Header:
     """Return a header of a readable format as one of ``FORMAT``."""
-    return PREVIOUS.upgrade(header) if PREVIOUS and file_format < FORMAT else header
+    return MIGRATION.upgrade(header) if MIGRATION and file_format < FORMAT else header
 
 
 def downgrade(header: Header, file_format: int) -> Header:
     """Return a header of ``FORMAT`` as one of a format that this version writes."""
-    return PREVIOUS.downgrade(header) if PREVIOUS and file_format < FORMAT else header
+    return MIGRATION.downgrade(header) if MIGRATION and file_format < FORMAT else header
 
 
 CHUNK_BYTES = 1 << 20
@@ -142,7 +142,7 @@ class PartitionCheckpoint:
         deferred: Deferred messages by pack, in the order in which the packs are served.
         in_force: Row and cell file of each pack at this position of the stream, for packs with processed blocks.
         increment: 0 if the records of all packs are contained; otherwise the number of the increment.
-        changed: Packs that were changed since the last saved checkpoint; None: unknown.
+        changed: Packs that have changed since the last saved checkpoint; None: unknown.
     """
 
     number: int
@@ -170,7 +170,7 @@ class PartitionCheckpoint:
         )
 
     def with_increment(self, increment: "PartitionCheckpoint") -> "PartitionCheckpoint":
-        """Return the checkpoint of an increment and of the checkpoint before it, which is this one."""
+        """Return this checkpoint with the changes of the next increment."""
         packs = {pack: packed for pack, packed in self.packs.items() if pack not in increment.other_layouts}
         other_layouts = {pack: state for pack, state in self.other_layouts.items() if pack not in increment.packs}
         return replace(

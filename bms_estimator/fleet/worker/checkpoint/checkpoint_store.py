@@ -109,8 +109,8 @@ class CheckpointStore:
     async def claim(self, partition: int) -> Claim:
         """Take over a partition from its present owner, if any, and remove its objects that the pointer does not name.
 
-        Such objects remain after a write that a worker did not finish, and after a roll-back to a version that does not
-        know daily checkpoints or increments, because such a version leaves them out of the pointer.
+        Such objects remain after an unfinished write, and after a roll-back to a version without daily checkpoints or increments,
+        which it leaves out of the pointer.
 
         Raises:
             FencedError: Another worker has claimed it at the same time.
@@ -119,7 +119,7 @@ class CheckpointStore:
         stored = await self.claims.read(partition)
         if stored is None:
             return await self.claims.write(partition, 0, CheckpointPointer())  # revision 0: the key must not exist
-        # listed before the claim: later objects may be those of a worker that claims the partition next
+        # listed before the claim, because the next owner may write objects after it
         objects = await self._objects.names(partition)
         counted = stored.pointer.model_copy(update={"unsaved_claims": stored.pointer.unsaved_claims + 1})
         claim = await self.claims.write(partition, stored.revision, counted)
@@ -188,7 +188,7 @@ class CheckpointStore:
         return await self._replace_pointer(claim, new_pointer)
 
     async def replace(self, claim: Claim, old: CheckpointInfo, chunks: Iterator[bytes] | None) -> Claim:
-        """Replace a stored checkpoint by a whole one of the same messages, or remove it.
+        """Replace a stored checkpoint by a whole one with the same sequence number, or remove it.
 
         Objects that no other checkpoint needs are overwritten on the disk.
 
@@ -227,7 +227,7 @@ class CheckpointStore:
         return await self._replace_pointer(claim, CheckpointPointer(kept=(info,), daily=claim.pointer.daily))
 
     def _with_whole(self, pointer: CheckpointPointer, info: CheckpointInfo) -> CheckpointPointer:
-        """Return a pointer with a whole checkpoint added. The oldest is left out, and each one that is known to be damaged."""
+        """Return a pointer with a whole checkpoint added. The oldest one and damaged ones are left out."""
         intact = (each for each in pointer.kept if each.object not in self._damaged)
         daily = pointer.daily if has_daily(pointer.daily, info.made_s) else (info, *pointer.daily)[:DAILY_CHECKPOINTS]
         return CheckpointPointer(kept=(info, *intact)[:CHECKPOINTS_PER_PARTITION], daily=daily)

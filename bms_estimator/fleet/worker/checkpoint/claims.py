@@ -2,9 +2,6 @@
 
 A worker that takes over a partition first writes its own name into the pointer. Therefore the next checkpoint of a slow or
 suspended former owner fails.
-
-A change of the checkpoints from outside the worker claims the partition as a worker does. The owner is thereby fenced out,
-drops the partition from its memory, and takes it over again from the changed checkpoints.
 """
 
 import asyncio
@@ -27,7 +24,7 @@ log = structlog.get_logger(__name__)
 
 
 RECEIPT_TIMEOUT_S = 2
-"""Timeout of the server's receipt of a record [s]."""
+"""Timeout of the server's response to the flush of a record [s]."""
 
 
 class ReplayRecord(BaseModel):
@@ -42,7 +39,7 @@ class ReplayRecord(BaseModel):
 
 
 class ReplayRecords:
-    """Records of one tenant.
+    """Stored records of guarded replays.
 
     Args:
         nc: Connection to the tenant's NATS account.
@@ -62,11 +59,11 @@ class ReplayRecords:
     async def deliver(self, partition: int, record: ReplayRecord) -> None:
         """Send the record of a guarded replay, and wait until the server has received it.
 
-        Its storage is not awaited, because each worker that is killed while no node leads the stream would seem to die of the
-        first block of its replay.
+        The function does not wait until the record is stored. While no node leads the stream, it would wait at the first block of
+        the replay, and the end of the worker would count as a death in this block.
         """
         await self.send(partition, record)
-        await asyncio.sleep(0)  # nats-py writes the ping of a flush at once, and other messages in a task
+        await asyncio.sleep(0)  # lets a task of nats-py write the record before the flush writes a ping
         await self._nc.flush(RECEIPT_TIMEOUT_S)
 
     async def send(self, partition: int, record: ReplayRecord) -> None:
@@ -110,7 +107,9 @@ class Claims:
     def __init__(self, worker: str, bucket: KeyValue) -> None:
         self._worker, self._bucket = worker, bucket
         self._object_names = NUID()
-        self._last_sent: dict[int, CheckpointPointer] = {}  # by partition; its response may have been lost
+        self._last_sent: dict[
+            int, CheckpointPointer
+        ] = {}  # by partition; the pointer may be stored although no response arrived
 
     async def check_format(self, partition: int) -> None:
         """Check that the last checkpoint of a partition can be read.
@@ -121,7 +120,7 @@ class Claims:
         await self.read(partition)
 
     async def read(self, partition: int) -> StoredPointer | None:
-        """Return the pointer of a partition, whose last checkpoint can be read; None without a pointer.
+        """Return the pointer of a partition; None without one.
 
         Raises:
             UnreadableFormatError: The pointer is not one of this version, or the last checkpoint has a format that this version
@@ -155,7 +154,7 @@ class Claims:
         state = (await self._bucket.status()).stream_info.state
         return bool(claim.revision > state.last_seq)
 
-    async def end(self, claim: Claim) -> None:
+    async def record_release(self, claim: Claim) -> None:
         """Record an orderly release of a partition whose last checkpoint is up to date.
 
         Raises:

@@ -193,10 +193,10 @@ def test_state_is_bit_identical_after_an_upgrade_that_changed_no_field_of_the_es
     previous_record = RecordWithLayout(layout_of(previous.record.dtype), previous.packed_bytes())
     snapshot = replace(stream.partition.snapshot(), packs={}, other_layouts={"a": previous_record})
     upgraded = Partition.restore(5, table, to_bytes(snapshot))
-    assert upgraded.take("a", blocks[98], upgraded.sequence + 1).state is None  # it was processed before
+    assert upgraded.process("a", blocks[98], upgraded.sequence + 1).state is None  # it was processed before
     for data in blocks[100:]:
         for partition in (stream.partition, upgraded):
-            partition.take("a", data, partition.sequence + 1)
+            partition.process("a", data, partition.sequence + 1)
     assert upgraded.snapshot().other_layouts == {}
     assert upgraded.state("a")["estimator"].tobytes() == stream.partition.state("a")["estimator"].tobytes()
     assert upgraded.state("a")["hour"].tobytes() == stream.partition.state("a")["hour"].tobytes()
@@ -232,7 +232,7 @@ class TestPreviousLayout:
         next_block = blocks_of(samples)[150]
         sequence = migrated.sequence + 1
         expected, estimate = (
-            Estimate.model_validate_json(partition.take("a", next_block, sequence).state)
+            Estimate.model_validate_json(partition.process("a", next_block, sequence).state)
             for partition in (unmigrated, migrated)
         )
         assert estimate.soc == pytest.approx(expected.soc, abs=0.005)
@@ -245,20 +245,20 @@ class TestPreviousLayout:
         _, data = previous_layout
         partition = Partition.restore(5, table, data)
         blocks = blocks_of(samples)
-        assert partition.take("a", blocks[3], partition.sequence + 1).state is None  # it was processed before
+        assert partition.process("a", blocks[3], partition.sequence + 1).state is None  # it was processed before
         partition.snapshot()
         partition.mark_saved(is_whole=True)
-        assert partition.take("a", blocks[155], partition.sequence + 1).reply.number == 3000 // SAMPLES + 1
+        assert partition.process("a", blocks[155], partition.sequence + 1).reply.number == 3000 // SAMPLES + 1
         assert partition.counters["packs"] == 1
         assert partition.snapshot().other_layouts == read_checkpoint(data).other_layouts
         restored = Partition.restore(5, table, to_bytes(partition.snapshot()))
-        assert restored.take("a", blocks[150], restored.sequence + 1).state
+        assert restored.process("a", blocks[150], restored.sequence + 1).state
 
     def test_record_is_migrated_after_a_lost_block(self, previous_layout, samples) -> None:
         _, data = previous_layout
         partition = Partition.restore(5, table, data)
         early_block = blocks_of(samples)[151]
-        states = [partition.take("a", early_block, partition.sequence + 1).state for _ in range(MAX_EARLY_REPEATS)]
+        states = [partition.process("a", early_block, partition.sequence + 1).state for _ in range(MAX_EARLY_REPEATS)]
         assert [state is None for state in states] == (MAX_EARLY_REPEATS - 1) * [True] + [False]
         assert partition.counters["lost_blocks"] == 1
         assert partition.snapshot().other_layouts == {}
@@ -270,8 +270,8 @@ class TestPreviousLayout:
         with monkeypatch.context() as patched:
             patched.setattr("bms_estimator.fleet.worker.partition.density_fault", lambda _: "too many samples")
             for _ in range(MAX_EARLY_REPEATS):
-                partition.take("a", early_block, partition.sequence + 1)
-        assert partition.take("a", following, partition.sequence + 1).state
+                partition.process("a", early_block, partition.sequence + 1)
+        assert partition.process("a", following, partition.sequence + 1).state
         assert (partition.counters["lost_blocks"], partition.counters["too_dense"]) == (1, 1)
 
     def test_record_that_does_not_fit_its_layout_is_reset(self, samples) -> None:
@@ -279,5 +279,5 @@ class TestPreviousLayout:
         partition = Partition.restore(
             5, table, to_bytes(PartitionCheckpoint(5, 0, other_layouts={"a": previous_record}))
         )
-        assert partition.take("a", blocks_of(samples)[0], 1).state
+        assert partition.process("a", blocks_of(samples)[0], 1).state
         assert partition.counters["damaged_states"] == 1

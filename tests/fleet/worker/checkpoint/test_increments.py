@@ -191,5 +191,5 @@ def test_states_of_increments_are_bit_identical_after_any_order_of_blocks_and_sa
             assert read_checkpoint(data) == snapshot
     restored = Partition.restore(5, table, data)
     for sequence, (pack, message) in enumerate(stream.messages, 1):
-        restored.take(pack, message, sequence)
+        restored.process(pack, message, sequence)
     assert restored.snapshot().packs == stream.partition.snapshot().packs
