@@ -33,7 +33,7 @@ async def stored_blocks(nc: Client) -> int:
 
 
 async def result_lines(nc: Client, observer: Observer, takeover_s: float, lags_before_kill: int) -> list[str]:
-    """Return the lines of the table.
+    """Return the lines of the table of results.
 
     Args:
         nc: Connection to the server.
@@ -68,7 +68,7 @@ SPEED = 10.0
 SEED = 7
 """Seed of the simulated packs."""
 OUTAGE_DAYS = 1
-"""Outage for which the streams have space [days], much longer than the demo, so that a small disk suffices."""
+"""Outage for which the streams have space [days]. It is much longer than the demo, but short enough for a small disk."""
 CHECKPOINT_S = 10
 """Interval of checkpoints [s]."""
 COLLECT_S = 1
@@ -131,7 +131,8 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
 
 
 async def _run_steps(demo: Demo, processes: Processes, stack: contextlib.AsyncExitStack) -> None:
-    # the edges are faster than real time, and their clocks must not get ahead of the server's while two steps wait
+    # in the past, because the edges are faster than real time, and must not get ahead of the server's clock, even if two steps
+    # take until their timeouts
     begin_s = int(time.time() - SPEED * (demo.seconds + 2.0 * TIMEOUT_S)) - BLOCK_S
     fleet = SimulatedFleet(demo.packs, seed=SEED, begin_ns=begin_s * 10**9)
     demo.report(

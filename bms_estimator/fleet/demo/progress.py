@@ -44,7 +44,7 @@ class Progress:
         return time.monotonic() - self._begin_s
 
     async def show(self, until_s: float, processes: Processes) -> None:
-        """Report rows until a time [s since the edges began to send], at least one.
+        """Report at least one row, and further ones until a time [s since the edges began to send].
 
         Raises:
             UserError: A process has ended.
@@ -64,7 +64,7 @@ class Progress:
         return _RowEnd(self.elapsed_s, observer.processed, len(observer.lags_s), len(observer.errors))
 
     def _row(self) -> str:
-        """Return the row of the time since the previous one."""
+        """Return a row of the table for the time since the previous row."""
         observer, before, now = self._observer, self._last_row_end, self._row_end()
         self._last_row_end = now
         rate = (now.processed - before.processed) / (now.elapsed_s - before.elapsed_s)

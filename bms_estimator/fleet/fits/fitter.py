@@ -1,7 +1,7 @@
 """Process that fits the models of packs to their histories, at the requests of workers.
 
-The process has no state of its own. The requests wait in the stream ``FITS``. The rows of a pack, or its whole history after the
-previous fit, are in the stream ``HISTORY``. Several processes share the requests.
+The process has no state of its own, so that several processes can share the requests, which wait in the stream ``FITS``. The stream
+``HISTORY`` has the history of a pack up to its last fit as one message, and later rows.
 """
 
 import asyncio
@@ -39,14 +39,14 @@ from bms_estimator.process.tasks import until_first_ends
 NAME = "fit"
 """Name of the process, for systemd and the server, and of the durable consumer."""
 FETCH_S = 1.0
-"""Timeout of a request for requests for fits [s]."""
+"""Timeout of a fetch from the stream ``FITS`` [s]."""
 ACK_S = 300.0
 """Time after which the server delivers an unanswered request again [s]. A fit to the longest history takes 4 s."""
 RETRY_S = 5.0
 """Retry interval after an error, or while rows are not stored yet [s]."""
 MAX_DELIVERIES = 5
-"""Number of deliveries after which a request is dropped, for example because its fit ends the process. The worker sends another one
-after the interval between two fits."""
+"""Maximum number of deliveries of a request, because a fit may kill the process. The worker sends another request after the
+interval between two fits."""
 STATUS_S = 60.0
 """Interval between two log lines with the counters [s]."""
 
@@ -143,7 +143,7 @@ class Fitter:
             return ()
 
     async def _answer(self, message: Msg) -> None:
-        """Answer one request; if this is not possible now, the server delivers it again."""
+        """Answer one request, or let the server deliver it again if rows are missing or were added meanwhile."""
         pack = message.subject.split(".")[1]
         if message.metadata.num_delivered > MAX_DELIVERIES or not (job_data := self._parse(pack, message.data)):
             self.counters["dropped"] += 1
@@ -169,10 +169,10 @@ class Fitter:
     def _parse(self, pack: str, data: bytes) -> tuple[FitRequest, np.ndarray] | None:
         """Return a request and the settings of its pack; None if the request is damaged or the pack is unknown."""
         try:
-            request, known = FitRequest.model_validate_json(data), self._bucket.packs(pack)
+            request, settings_and_model = FitRequest.model_validate_json(data), self._bucket.packs(pack)
         except ValidationError:
             return None
-        return known and (request, np.array([type_estimator(*known).cell_file_settings]))
+        return settings_and_model and (request, np.array([type_estimator(*settings_and_model).cell_file_settings]))
 
     async def _run(self, job: FitJob) -> FitAnswer | None:
         """Run a fit in another process. Return None if rows are missing, or if the process has died."""

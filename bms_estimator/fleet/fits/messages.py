@@ -23,7 +23,7 @@ COMPARED = np.dtype(
 )
 """Record of a ``ComparedCell``, with the same fields."""
 MAGIC = b"BMSF"
-"""First bytes of the result of a fit; those of a block differ."""
+"""First bytes of the result of a fit, different from those of a block."""
 
 
 class RowsPosition(NamedTuple):
@@ -32,7 +32,7 @@ class RowsPosition(NamedTuple):
     sequence: int
     """Stream sequence number of the block that completed the rows."""
     part: int
-    """Number of the message among those of this block."""
+    """Index of the message among the messages of this block."""
 
 
 class Rows(NamedTuple):
@@ -71,9 +71,9 @@ class FitResult(NamedTuple):
     fit: PackFit | None = None
     """The fit; None if it failed."""
     min_filter_std: float = 0.0
-    """Std of the filter's SOC from which on the fit is adopted."""
+    """Minimum std of the filter's SOC at which the fit is adopted."""
     weakest: ComparedCell | None = None
-    """Weakest cell of a bank by the discharges since the previous fit; None: no discharge shows it."""
+    """Weakest cell of a bank according to the discharges since the previous fit; None: unknown."""
 
 
 _WEAKEST = "weakest_"

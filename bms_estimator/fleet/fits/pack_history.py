@@ -72,7 +72,7 @@ class PackHistory:
         self.position, self._digest = max(position, self.position), digest
 
     def _add_rows(self, rows: NDArray[np.void], position: RowsPosition) -> None:
-        """Append rows. Drop rows that a takeover has repeated. After a return to an earlier checkpoint, drop the later rows."""
+        """Append rows, unless a worker has sent them again after a takeover. After a return to an earlier checkpoint, drop later rows."""
         before = self._history.rows
         if rows.size and before.size and rows["elapsed_s"][0] <= before["elapsed_s"][-1]:
             if position <= self.position:
@@ -97,7 +97,7 @@ class PackHistory:
         self._new_rows = 0
         try:
             fitted = fit(cell, rows, previous)
-        except Exception:  # noqa: BLE001 - an odd history of one pack; the result reports the failure
+        except Exception:  # noqa: BLE001 - the result reports the failure
             self._failures += 1
             if self._failures == MAX_FAILED_FITS:
                 self._reset()
@@ -112,7 +112,7 @@ class PackHistory:
         monitor = BankMonitor(cell)
         try:
             monitor.add(self._history, self._new_rows, previous)
-        except Exception:  # noqa: BLE001 - an odd value of the history must not prevent the fit
+        except Exception:  # noqa: BLE001 - the comparison must not prevent the fit
             return None
         return monitor.weakest
 
@@ -150,7 +150,7 @@ class FitAnswer:
     Attributes:
         result: Encoded ``FitResult``; None: the request was answered before.
         history: Encoded history, which replaces the messages of the job.
-        error: Reason for which some messages were skipped; empty: none.
+        error: Reason for which messages were skipped; empty if none was.
     """
 
     result: bytes | None
@@ -169,8 +169,8 @@ def run_job(job: FitJob) -> FitAnswer | None:
                 later.append(arrays)
             else:
                 history.add(arrays)
-        except (ValueError, KeyError) as odd:
-            error = str(odd)
+        except (ValueError, KeyError) as damage:
+            error = str(damage)
     if history.answered == job.request.sequence:
         return FitAnswer(None, history.to_bytes(), error)
     if history.position < job.request.position and not error:

@@ -42,7 +42,7 @@ DURABLE = "collector"
 PERIOD_S = 300.0
 """Maximum time that a row waits for its file [s]. A shorter time gives more files a day, which slow down queries."""
 MAX_ROWS = 10_000
-"""Maximum number of rows of a file. The rows wait in memory and take 5 kB each."""
+"""Maximum number of rows of a file. Until it is written, the rows wait in memory and take 5 kB each."""
 FETCH_ROWS = 1000
 """Maximum number of rows in one request."""
 FETCH_S = 0.5
@@ -78,10 +78,8 @@ class Collector:
         self._compacted_s = self._first_waiting_s  # last merge of files
         self._table_read_s = -math.inf
         self._table = BucketReader(nc, PACKS_BUCKET)
-        self._listed, self._stored_packs = (
-            dict[str, int](),
-            read_packs(folder),
-        )  # packs in the table, and in ``PACKS_FILE``
+        # hour of addition to the table, of the packs in the table and of those in ``PACKS_FILE``
+        self._listed, self._stored_packs = dict[str, int](), read_packs(folder)
         self.counters = Counter[str]()
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -198,7 +196,7 @@ class Collector:
 
 
 def compact_days(folder: Path, now_s: float) -> None:
-    """Merge the files of the days of ``days_to_compact``, also in quarantine. Disk errors are logged; the next call retries.
+    """Merge the files of the days that ``days_to_compact`` returns, also in quarantine. Errors are logged; the next call retries.
 
     Args:
         folder: Folder of the Parquet files.

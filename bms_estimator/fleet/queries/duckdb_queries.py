@@ -41,7 +41,7 @@ CHARGE_ERROR = 0.002
 READ_ONLY_STATEMENTS = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 """Types of statements that a user's SQL query may contain."""
 MAX_ROW_AGE_H = 3
-"""Age of the newest row from which on a warning asks whether the collector runs [h]."""
+"""Age of the newest row above which a note asks if workers and collector run [h]."""
 EXPECTED_FALSE_REPORTS = 0.1
 """Expected number of packs of the fleet that are reported by chance, for each quantity."""
 MIN_STDS = 3.0
@@ -89,14 +89,14 @@ class Limits:
     min_spread: float = 0.01
     """Query outliers: lower bound of the relative standard deviation between packs of a type."""
     recent_days: int = 3
-    """Query failing: number of most recent days. A pack is reported if more than half of them have a new input fault.
-    Faulty cells are those of more than half of the hours of these days."""
+    """Query failing: number of most recent days. A pack is reported if more than half of the days have a new input fault, and a cell
+    if it is faulty in more than half of the hours of these days."""
     weak_cell_soc: float = 0.03
-    """Query failing: SOC below the mean of the cells by which a cell lies at least, three standard deviations being subtracted."""
+    """Query failing: minimum deviation of a cell's SOC below the mean of the cells, after subtraction of three standard deviations."""
     small_cell_ratio: float = 0.9
     """Query failing: upper limit of the capacity of a cell, relative to the median of the cells."""
     resistive_cell_ratio: float = 1.25
-    """Query failing: lower limit of the resistance of a cell, relative to the median; two standard deviations are subtracted."""
+    """Query failing: minimum resistance of a cell, relative to the median, after subtraction of two standard deviations."""
     self_discharge_c: float = MIN_SHORT_C
     """Query failing: minimum self-discharge of a cell above the median cell, as a C-rate [1/h]."""
     silent_hours: int = 2
@@ -202,18 +202,18 @@ def server_errors(folder: Path, *, wall: Callable[[], float]) -> tuple[list[int]
     with open_database(folder, wall=wall) as (database, present):
         _run(database, _sql("server_errors"), vars(LIMITS) | _parameters(present))
         rows = database.execute("SELECT received_hour FROM server_errors").fetchall()
-        return [hour for (hour,) in rows], present.asked_hour
+        return [hour for (hour,) in rows], present.present_hour
 
 
 class Present(NamedTuple):
     """Present time of the queries."""
 
-    asked_hour: int
+    present_hour: int
     """Present hour of this machine, or of the servers if this machine's clock is behind [hours since 1970]."""
     now_hour: int
     """Last complete hour on the server's clock when the newest row arrived [hours since 1970]."""
     notes: tuple[str, ...] = ()
-    """Wrong clocks."""
+    """Warnings about wrong clocks and outdated rows."""
 
 
 @contextlib.contextmanager
@@ -242,7 +242,7 @@ def open_database(
         first = "" if days is None else _day_name(present.now_hour - 24 * (days - 1))
         valid_files = {day: files for day, files in files.items() if first <= day.name <= last}
         _create_hours_view(database, valid_files)
-        # without an end, because a server whose clock was ahead received the rows of the last days
+        # without a last day: while the server's clock was ahead, rows arrived at later days
         late = [str(file) for day, day_files in quarantined.items() if first <= day.name for file in day_files]
         _read_files(database, late).create_view("quarantined")
         _create_listed_packs(database, folder)
@@ -251,7 +251,7 @@ def open_database(
 
 @contextlib.contextmanager
 def _user_errors(folder: Path) -> Iterator[None]:
-    """Raise errors of damaged or replaced files as ``UserError``."""
+    """Convert errors of damaged or replaced files to ``UserError``."""
     try:
         yield
     except (duckdb.InvalidInputException, duckdb.IOException) as error:
@@ -345,7 +345,7 @@ def _read_files(database: duckdb.DuckDBPyConnection, names: list[str]) -> duckdb
 
 
 def _create_listed_packs(database: duckdb.DuckDBPyConnection, folder: Path) -> None:
-    """Create the view ``listed``: the packs in the server's table, as the collector has stored it. Without it, the view is empty."""
+    """Create the view ``listed`` of the packs in the table that the collector has stored; empty without a stored table."""
     file = folder / PACKS_FILE
     if file.exists():
         database.read_parquet(str(file)).create_view("listed")
@@ -354,7 +354,7 @@ def _create_listed_packs(database: duckdb.DuckDBPyConnection, folder: Path) -> N
 
 
 def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path, list[Path]]) -> None:
-    """Create the view ``hours``. Only days with files that were not merged can have several rows of one hour.
+    """Create the view ``hours``. Only unmerged files can have several rows of one hour.
 
     Raises:
         UserError: The files have other columns.
@@ -379,7 +379,7 @@ def _create_hours_view(database: duckdb.DuckDBPyConnection, files: Mapping[Path,
 
 def _parameters(present: Present) -> dict[str, Any]:
     return {
-        "asked_hour": present.asked_hour,
+        "present_hour": present.present_hour,
         "now_hour": present.now_hour,
         "today": present.now_hour // 24,
         "aged_soc": AGED_SOC,

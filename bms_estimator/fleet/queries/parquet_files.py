@@ -31,22 +31,22 @@ PACKS_FILE = "_packs.parquet"
 UNFINISHED_SUFFIX = ".part"
 """Suffix of the name of an unfinished file."""
 MAX_FILES_PER_DAY = 48
-"""Number of files at which the files of a day are merged, although the day has not ended or was merged before."""
+"""Number of files at which the files of a day are merged, even if the day has not ended or was merged before."""
 ROW_GROUP = 100_000
 """Size of a row group [rows], the smallest unit that a query reads."""
 DAY_CLOSE_DELAY_S = 2 * HOUR_S
 """Time after the end of a day at which its files are merged [s], because most late blocks have arrived by then."""
 LATE_DELAY_S = HOUR_S
-"""Minimum age of a file with late rows, for which a merged day is merged again [s]. The delay collects further late rows, because
-each merge writes the whole day."""
+"""Minimum age of a file with late rows, before its day is merged again [s]. The delay collects further late rows, because each
+merge writes the whole day."""
 MERGE_MEMORY = "500MB"
-"""Memory limit of a merge. A day of 100,000 packs is larger. DuckDB then sorts it in parts on the disk."""
+"""Memory limit of a merge. DuckDB sorts a larger day, such as that of 100,000 packs, on the disk."""
 _MAGIC = b"PAR1"
 """First and last bytes of a Parquet file."""
 
 
-def _column(annotation: object) -> pa.DataType:
-    """Return the column type. Single precision exceeds the accuracy of any value, and halves the size of the files."""
+def _column_type(annotation: object) -> pa.DataType:
+    """Return the type of a column. Single precision suffices for all values, and halves the size of the files."""
     types: dict[object, pa.DataType] = {
         str: pa.string(),
         str | None: pa.string(),
@@ -57,7 +57,7 @@ def _column(annotation: object) -> pa.DataType:
     return types.get(annotation, pa.float32())
 
 
-SCHEMA = pa.schema([(name, _column(field.annotation)) for name, field in Hour.model_fields.items()])
+SCHEMA = pa.schema([(name, _column_type(field.annotation)) for name, field in Hour.model_fields.items()])
 VALID_ROWS = "SELECT * FROM rows QUALIFY row_number() OVER (PARTITION BY pack, hour ORDER BY revision DESC NULLS LAST, samples DESC) = 1"
 """SQL query for one row of each hour and pack from ``rows``. A row without a revision is from an older worker. Two rows of
 one revision differ if a worker without a checkpoint has read only the end of the hour from the stream."""

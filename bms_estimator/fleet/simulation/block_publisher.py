@@ -149,7 +149,7 @@ async def run_edges(
     topics = [raw(name).replace(".", "/") for name in fleet.names]
     sent_bytes, last_progress_s, last_busy_s = 0, time.monotonic(), time.monotonic()
     try:
-        while not await _ended(stop) and time.monotonic() - last_busy_s < quiet_s:
+        while not await _wait_for_stop(stop) and time.monotonic() - last_busy_s < quiet_s:
             _process_replies(replies, edges)
             sent_bytes += _send(fleet, edges, open_connections, topics)
             if not edges.done or any(connection.in_flight for connection in open_connections):
@@ -163,7 +163,7 @@ async def run_edges(
             await asyncio.to_thread(connection.end)
 
 
-async def _ended(stop: asyncio.Event) -> bool:
+async def _wait_for_stop(stop: asyncio.Event) -> bool:
     """Wait up to ``POLL_S`` for ``stop``; return True if it is set."""
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(stop.wait(), POLL_S)

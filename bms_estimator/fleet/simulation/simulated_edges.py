@@ -5,19 +5,19 @@ from typing import NamedTuple
 import numpy as np
 
 from bms_estimator.edge.subjects import BlockRequest
-from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet, Whole
+from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, Ints, SimulatedFleet
 from bms_estimator.model.arrays import Floats
 
 RESEND_S = 5.0
-"""Minimum interval between two resends of a block [s]: a lagging worker repeats its request before the resent block can
-arrive."""
+"""Minimum interval between two resends of a block [s], because a lagging worker repeats its request before the resent block
+arrives."""
 
 
 class Due(NamedTuple):
     """Due blocks, at most one of each pack. Arrays of equal shape."""
 
-    packs: Whole
-    numbers: Whole
+    packs: Ints
+    numbers: Ints
     arrival_s: Floats
     """Wall clock of their last samples [s since 1970]."""
 
@@ -29,13 +29,13 @@ class SimulatedEdges:
         fleet: Simulated packs.
         start_s: Wall clock at which the first block began [s since 1970].
         speed: Simulated seconds per second.
-        last: Number of the last block of each edge; None without end.
+        last: Number of the last block of each edge; None: the edges send without end.
 
     Attributes:
         last: Argument ``last``, which may be changed.
         next_number: Number of the block that each edge sends next, shape (packs,). A request for an earlier block lowers it.
         first_unsent: Lowest number that each edge has never sent, shape (packs,).
-        confirmed_below: Number below which workers have confirmed all blocks of each edge, shape (packs,).
+        confirmed_below: Number of the first unconfirmed block of each edge, shape (packs,).
         resends: Number of requests to resend.
         sent: Number of blocks sent, with repetitions.
         repeated: Number of blocks sent that were sent before.
@@ -45,10 +45,10 @@ class SimulatedEdges:
         self._fleet, self._start_s, self._speed, self.last = fleet, start_s, speed, last
         self._index = {name: i for i, name in enumerate(fleet.names)}
         self._store_offset_s = (fleet.store_created_ns - fleet.begin_ns) / 1e9
-        self.next_number: Whole = np.ones(len(fleet.names), dtype=np.int64)
+        self.next_number: Ints = np.ones(len(fleet.names), dtype=np.int64)
         self.confirmed_below = self.next_number.copy()
         self.first_unsent = self.next_number.copy()
-        self._requested: Whole = np.zeros(len(fleet.names), dtype=np.int64)
+        self._requested: Ints = np.zeros(len(fleet.names), dtype=np.int64)
         self._requested_s: Floats = np.full(len(fleet.names), -np.inf)
         self.resends = self.sent = self.repeated = 0
 
@@ -91,7 +91,7 @@ class SimulatedEdges:
         ready_s = self._ready_s(self.next_number)
         return 0.0 if self.done else max(0.0, now_s - float(ready_s.min()))
 
-    def _ready_s(self, numbers: Whole) -> Floats:
+    def _ready_s(self, numbers: Ints) -> Floats:
         """Return the wall clock at which a block of each pack is complete [s since 1970]."""
         end_s = self._store_offset_s + numbers * BLOCK_S
         return self._start_s + end_s / self._speed

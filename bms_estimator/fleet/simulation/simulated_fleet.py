@@ -24,7 +24,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
 
-Whole = NDArray[np.int64]
+Ints = NDArray[np.int64]
 Bits = NDArray[np.uint64]
 
 BLOCK_S = 60
@@ -49,7 +49,7 @@ direction, so that the mean is zero."""
 PULSE_C = 0.6
 """Maximum current of a pulse as a C-rate [1/h]."""
 PAST_PULSES = 5
-"""Number of past pulses in the branch current. Of an older pulse less than e^(-300/20) remains."""
+"""Number of past pulses in the branch current. The current of an older pulse has decayed to less than e^(-300/20)."""
 TAU_TS_S = 20.0
 """Time constant of the fast RC branch [s]."""
 TAU_TL_S = 800.0
@@ -89,7 +89,7 @@ class _Draw(IntEnum):
 
 
 class Kind(NamedTuple):
-    """Values that many packs share."""
+    """Kind of pack: configured values that many packs share."""
 
     cell: str
     capacity_ah: float | None
@@ -142,7 +142,7 @@ class Truth:
     capacity_as: Floats
     """True capacity [A s]."""
     resistance: Floats
-    """True divided by the cell file's resistances."""
+    """True resistances divided by those of the cell file."""
 
 
 class SimulatedFleet:
@@ -156,7 +156,8 @@ class SimulatedFleet:
 
     Attributes:
         names: Names of the packs.
-        store: Creation time of each edge's store [ns since 1970], shape (packs,).
+        begin_ns: Argument ``begin_ns``.
+        store_created_ns: Creation time of each edge's store [ns since 1970], shape (packs,).
         truth: Ground truth of the packs.
     """
 
@@ -168,13 +169,13 @@ class SimulatedFleet:
         self._kind_index = pack % len(KINDS)
         store_delay_s = self._uniform(pack, _Draw.STORE_DELAY) * BLOCK_S
         self.begin_ns = begin_ns
-        self.store_created_ns: Whole = begin_ns + (store_delay_s * 1e9).astype(np.int64)
+        self.store_created_ns: Ints = begin_ns + (store_delay_s * 1e9).astype(np.int64)
         self._omega = 2.0 * math.pi / (MIN_PERIOD_S + (MAX_PERIOD_S - MIN_PERIOD_S) * self._uniform(pack, _Draw.PERIOD))
         self._phase = 2.0 * math.pi * self._uniform(pack, _Draw.PHASE)
         self._temperature_c = np.round(20.0 + 10.0 * self._uniform(pack, _Draw.TEMPERATURE), 1)
         self.truth = self._draw_truth(pack)
 
-    def _draw_truth(self, pack: Whole) -> Truth:
+    def _draw_truth(self, pack: Ints) -> Truth:
         defect = self._uniform(pack, _Draw.DEFECT)
         capacity = MIN_CAPACITY + (MAX_CAPACITY - MIN_CAPACITY) * self._uniform(pack, _Draw.CAPACITY)
         resistance = MIN_RESISTANCE + (MAX_RESISTANCE - MIN_RESISTANCE) * self._uniform(pack, _Draw.RESISTANCE)
@@ -187,7 +188,7 @@ class SimulatedFleet:
         """Return the kind of a pack as in the table of packs."""
         return KINDS[self._kind_index[pack]]
 
-    def blocks(self, packs: Whole, numbers: Whole, arrival_s: Floats) -> Iterator[bytes]:
+    def blocks(self, packs: Ints, numbers: Ints, arrival_s: Floats) -> Iterator[bytes]:
         """Yield one encoded block of each pack, as edges send it.
 
         Args:
@@ -206,7 +207,7 @@ class SimulatedFleet:
             )
             yield encode(block)
 
-    def samples(self, packs: Whole, numbers: Whole) -> SampleBlock:
+    def samples(self, packs: Ints, numbers: Ints) -> SampleBlock:
         """Return the samples of one block of each pack: shape (n, BLOCK_S), dtype ``SAMPLE``."""
         second = np.arange(BLOCK_S)
         index = ((numbers[:, None] - 1) * BLOCK_S + second).astype(np.int64)
@@ -216,7 +217,7 @@ class SimulatedFleet:
         for kind_index, (declared, curves) in enumerate(zip(KINDS, self._curves, strict=True)):
             rows = np.flatnonzero(self._kind_index[packs] == kind_index)
             if rows.size:
-                current_a, voltage_v = self._terminals(packs[rows], numbers[rows], curves)
+                current_a, voltage_v = self._current_and_voltage(packs[rows], numbers[rows], curves)
                 # within half a step of the current, and one step of the voltage
                 noise_a = self._uniform(packs[rows][:, None], _Draw.CURRENT_NOISE, index[rows]) - 0.5
                 noise_v = 2.0 * (self._uniform(packs[rows][:, None], _Draw.VOLTAGE_NOISE, index[rows]) - 0.5)
@@ -241,20 +242,20 @@ class SimulatedFleet:
         lines += [f"{name},{capacity_as / 3600.0:.4f},{factor:.4f}" for name, capacity_as, factor in rows]
         return "\n".join(lines) + "\n"
 
-    def soc(self, packs: Whole, time_s: Floats) -> Floats:
+    def soc(self, packs: Ints, time_s: Floats) -> Floats:
         """Return the true SOC 0..1 of each pack at its edge's ``time_s``, in the same shape."""
         minute = np.floor(time_s / BLOCK_S)
         pulse_a = self._pulse_a(packs, minute.astype(np.int64))
         pulse_as = pulse_a * _pulse_charge_s(time_s - minute * BLOCK_S)
         return self._slow_soc(packs, time_s) - pulse_as / self.truth.capacity_as[packs]
 
-    def _slow_soc(self, packs: Whole, time_s: Floats) -> Floats:
+    def _slow_soc(self, packs: Ints, time_s: Floats) -> Floats:
         angle = self._omega[packs] * time_s + self._phase[packs]
         return MEAN_SOC + SOC_AMPLITUDE * (
             SLOW_FRACTION * np.sin(angle) + FAST_FRACTION * np.sin(FREQUENCY_RATIO * angle)
         )
 
-    def _slow_a(self, packs: Whole, time_s: Floats) -> Floats:
+    def _slow_a(self, packs: Ints, time_s: Floats) -> Floats:
         """Return the current [A] that produces ``_slow_soc``, positive on discharge."""
         angle, omega = self._omega[packs] * time_s + self._phase[packs], self._omega[packs]
         slope = (
@@ -264,17 +265,17 @@ class SimulatedFleet:
         )
         return -slope * self.truth.capacity_as[packs]
 
-    def _pulse_a(self, packs: Whole, minutes: Whole) -> Floats:
+    def _pulse_a(self, packs: Ints, minutes: Ints) -> Floats:
         """Return the current of the pulse in each minute [A]."""
         return (
             PULSE_C / 3600.0 * self.truth.capacity_as[packs] * (2.0 * self._uniform(packs, _Draw.PULSE, minutes) - 1.0)
         )
 
-    def _terminals(self, packs: Whole, numbers: Whole, curves: _Curves) -> tuple[Floats, Floats]:
-        """Return true current [A] and voltage [V] in each second of a block, both of shape (n, BLOCK_S)."""
+    def _current_and_voltage(self, packs: Ints, numbers: Ints, curves: _Curves) -> tuple[Floats, Floats]:
+        """Return true current [A] and terminal voltage [V] in each second of a block, both of shape (n, BLOCK_S)."""
         column, second = packs[:, None], np.arange(BLOCK_S, dtype=np.float64)
         time_s = (numbers[:, None] - 1) * BLOCK_S + second
-        # a slow current that passes the slow branch is nearly delayed by the time constant
+        # to first order, the slow branch delays the slow current by its time constant
         slow_a, delayed_a = self._slow_a(column, time_s), self._slow_a(column, time_s - TAU_TL_S)
         # pulses of this minute (first column) and of the minutes before
         pulse_a = self._pulse_a(column, numbers[:, None] - 1 - np.arange(PAST_PULSES + 1))
@@ -289,14 +290,14 @@ class SimulatedFleet:
         drop_v = r_s * current_a + r_ts * branch_a + r_tl * delayed_a  # (2.4) of the thesis
         return current_a, ocv_v - self.truth.resistance[column] * drop_v
 
-    def _uniform(self, packs: Whole, draw: _Draw, index: Whole | int = 0) -> Floats:
+    def _uniform(self, packs: Ints, draw: _Draw, index: Ints | int = 0) -> Floats:
         """Return uniform numbers in [0, 1) that depend only on seed, pack, ``draw`` and ``index``."""
-        key = _mixed(np.asarray(packs, dtype=np.uint64) + (self._salt << np.uint64(32)) + np.uint64(draw << 56))
-        bits = _mixed(key + np.asarray(index).astype(np.uint64)) >> np.uint64(11)
+        key = _mix(np.asarray(packs, dtype=np.uint64) + (self._salt << np.uint64(32)) + np.uint64(draw << 56))
+        bits = _mix(key + np.asarray(index).astype(np.uint64)) >> np.uint64(11)
         return bits.astype(np.float64) * 2.0**-53  # a double has 53 bits
 
 
-def _mixed(bits: Bits) -> Bits:
+def _mix(bits: Bits) -> Bits:
     """Return pseudo-random bits: the finalizer of SplitMix64 (Steele et al., OOPSLA 2014)."""
     with np.errstate(over="ignore"):
         bits = bits * np.uint64(0x9E3779B97F4A7C15) + np.uint64(0x9E3779B97F4A7C15)
