@@ -87,8 +87,8 @@ class Hour(Payload):
     suspects: int = Field(description="bits of model.input_faults.InputFault")
     weakest_cell: int | None = Field(
         default=None,
-        description="number, from 1, of the series cell with the lowest sum of SOC deviation and three std; null before an estimate "
-        "of the single cells, as are the following fields up to self_discharge_std_a",
+        description="number, from 1, of the series cell with the lowest sum of SOC deviation and three std; null before an "
+        "estimate of the single cells, as are the following fields up to self_discharge_std_a",
     )
     weakest_cell_soc_deviation: float | None = Field(
         default=None, description="SOC of weakest_cell less the mean SOC of the cells"

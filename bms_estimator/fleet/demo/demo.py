@@ -1,6 +1,6 @@
 """Demo of a fleet: server, simulated edges, two workers, collector and page as processes.
 
-The demo explains its steps: packs send samples, three packs with faults are named, and a worker is killed. It ends with a
+The demo explains its steps: packs send samples, the fleet names the faults of three packs, and a worker is killed. It ends with a
 table of the measured results.
 """
 

@@ -1,7 +1,7 @@
 """Process that fits the models of packs to their histories, at the requests of workers.
 
-The process has no state of its own, so that several processes can share the requests, which wait in the stream ``FITS``. The stream
-``HISTORY`` has the history of a pack up to its last fit as one message, and later rows.
+The process has no state of its own, so that several processes can share the requests, which wait in the stream ``FITS``. The
+stream ``HISTORY`` has the history of a pack up to its last fit as one message, and later rows.
 """
 
 import asyncio

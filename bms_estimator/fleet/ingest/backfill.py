@@ -128,8 +128,8 @@ def _database(folder: Path) -> Iterator[duckdb.DuckDBPyConnection]:
 MAX_PART_SAMPLES = 4096
 """Maximum number of samples that are added at a time. They make at most as many blocks."""
 MAX_UNCONFIRMED_OF_PACK = 5000
-"""Number of unconfirmed blocks of a pack at which the backfill waits. ``MAX_PART_SAMPLES`` more blocks may follow. The sum is below
-``store_table.MAX_PACK_BLOCKS``, so that no block is dropped."""
+"""Number of unconfirmed blocks of a pack at which the backfill waits. ``MAX_PART_SAMPLES`` more blocks may follow. The sum is
+below ``store_table.MAX_PACK_BLOCKS``, so that no block is dropped."""
 MAX_UNCONFIRMED = 1_000_000
 """Number of unconfirmed blocks of all packs at which the backfill waits: 0.6 GB of minute blocks at 1 Hz."""
 SAVE_SAMPLES = 10_000

@@ -83,7 +83,7 @@ class BatchReader:
         self._find_cached = lru_cache(MAX_LAYOUTS)(self._find)
 
     def read(self, columns: BatchColumns) -> BatchSamples:
-        """Return the samples of a batch, in its order.
+        """Return the samples of a batch, in the order of the batch.
 
         Raises:
             BatchError: A column is missing, or a value is invalid. The message names column and row.

@@ -34,8 +34,8 @@ def decode_batch(payload: bytes) -> BatchColumns:
     """Return the columns of a batch.
 
     Args:
-        payload: Arrow IPC, or a JSON object: of lists, one for each column; of single values; or a list of objects, one for
-            each row.
+        payload: Arrow IPC; a JSON object of columns, each a list; a JSON object that is one row; or a JSON list of rows, each
+            an object.
 
     Raises:
         BatchError: The bytes are none of these, or the columns differ in length.

@@ -116,7 +116,7 @@ class IngestStore:
         return next_number - self._first_unconfirmed.get(pack, next_number)
 
     async def request_confirmation(self, pack: str) -> None:
-        """Send the last block again to which workers reply with a confirmation (``CONFIRM_EVERY``)."""
+        """Send the last block with a multiple of ``CONFIRM_EVERY`` as number again, because workers confirm such a block."""
         number = (self._open_blocks.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY
         if number >= self._first_unconfirmed.get(pack, 1):
             await self.publisher.send_one_again(pack, number)
@@ -238,6 +238,6 @@ class IngestStore:
         self._set_end(pack, other_ns, last_s)
 
     def _set_end(self, pack: str, store_ns: int, last_s: float) -> None:
-        """Begin a store at the next sample, and drop samples up to ``last_s`` and up to a second after another store's creation."""
+        """Begin a store at the next sample, later than ``last_s`` and than the second after another store's creation."""
         created_s = math.ceil(store_ns / NS) + 1  # the first sample sets the creation time of the new store
         self._open_blocks.set_position(pack, PackPosition(0, 1, max(last_s, created_s)))

@@ -19,7 +19,7 @@ UNAVAILABLE = 503
 RETRY_S = 1.0
 """Retry interval after the first internal error of the server [s]. Each further error doubles it."""
 MAX_FAILURES = 6
-"""Number of successive internal errors, within half a minute, after which the stream is damaged."""
+"""Number of successive internal errors, within half a minute, after which the stream counts as damaged."""
 
 
 class MissingStreamError(StreamError):

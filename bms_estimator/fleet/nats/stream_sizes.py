@@ -22,7 +22,7 @@ DAY_BLOCKS = 1440
 BLOCK_S = 60.0
 """Duration of a minute block [s], whose size is ``block_bytes``."""
 FIXED_FRACTION = 0.3
-"""Size of a block without samples, as a fraction of a minute block. A block of 10 samples has 179 bytes, one of 60 samples 509."""
+"""Size of a block without samples, as a fraction of a minute block. A block of 10 samples has 179 bytes, one of 60 has 509."""
 BLOCK_BYTES = 800
 """Size of a block of 60 samples in ``RAW``, with the server's overhead [bytes]."""
 HOUR_ROW_BYTES = 1900

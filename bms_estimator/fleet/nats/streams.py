@@ -1,8 +1,8 @@
 """Streams, buckets and consumers of one tenant.
 
 The stream ``RAW`` stores the blocks of samples that edges send, divided into partitions by pack. Each partition has a durable
-consumer, which the server pins to one worker at a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object buckets are streams with the
-configuration that all clients give them (ADR-8, ADR-20).
+consumer, which the server pins to one worker at a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object
+buckets are streams with the configuration that all clients give them (ADR-8, ADR-20).
 """
 
 import asyncio
@@ -147,7 +147,7 @@ async def require_partitions(nc: Client) -> int:
 async def make_telemetry_stream(nc: Client, max_bytes: int) -> None:
     """Create the stream ``TELEMETRY``, or set its maximum size. It has as many replicas as ``RAW``.
 
-    A full stream rejects new batches, so that their senders keep them.
+    A full stream rejects new batches, which their senders must then store.
 
     Raises:
         UserError: There is no stream ``RAW``, or the server has too little disk space.

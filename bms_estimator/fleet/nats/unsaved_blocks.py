@@ -1,4 +1,4 @@
-"""Share of the stream ``RAW`` that blocks fill which no checkpoint includes.
+"""Share of the stream ``RAW`` that consists of blocks in no checkpoint.
 
 When it reaches 1, the stream drops blocks that no checkpoint includes, and the edges must send them again.
 """

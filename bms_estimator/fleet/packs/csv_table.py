@@ -166,7 +166,7 @@ class _Reader:
         return name, *self._specs[key]
 
     def _spec(self, filled: Mapping[str, str]) -> PackSpec:
-        """Return the row of the filled columns, without the pack's name."""
+        """Return the specification in the filled columns."""
         values: dict[str, object] = {column: _value(column, value) for column, value in filled.items()}
         cell = filled.get("cell", "")
         if cell.endswith(CELL_FILE_SUFFIX):

@@ -130,7 +130,7 @@ def model_key(spec: PackSpec) -> tuple[object, ...]:
 
 
 def cell_of(spec: PackSpec, cell_file: str | None) -> PackModel:
-    """Return the model of a single cell. Arguments and errors are those of ``model_of``."""
+    """Return the model in a cell file, without ``series`` and ``parallel``. Arguments and errors are those of ``model_of``."""
     name = spec.cell
     if name in shipped_cell_names():
         return load_model(name, spec.capacity_ah)

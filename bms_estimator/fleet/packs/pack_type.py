@@ -1,4 +1,4 @@
-"""Type of packs. All packs of a type share one ``Pack``, because its creation takes longer than the estimation of a day's samples."""
+"""Type of packs. All packs of a type share one ``Pack``, because its creation takes longer than estimating a day's samples."""
 
 import hashlib
 import math

@@ -78,7 +78,7 @@ class Collector:
         self._compacted_s = self._first_waiting_s  # last merge of files
         self._table_read_s = -math.inf
         self._table = BucketReader(nc, PACKS_BUCKET)
-        # hour of addition to the table, of the packs in the table and of those in ``PACKS_FILE``
+        # hour of addition to the table by pack: of packs in the table, and of packs in ``PACKS_FILE``
         self._listed, self._stored_packs = dict[str, int](), read_packs(folder)
         self.counters = Counter[str]()
 

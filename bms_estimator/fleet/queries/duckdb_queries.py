@@ -45,7 +45,7 @@ MAX_ROW_AGE_H = 3
 EXPECTED_FALSE_REPORTS = 0.1
 """Expected number of packs of the fleet that are reported by chance, for each quantity."""
 MIN_STDS = 3.0
-"""Minimum deviation of a reported pack, which applies in a small fleet [standard deviations]."""
+"""Minimum deviation of a reported pack [standard deviations]. In a large fleet the limit is higher."""
 
 
 class Query(NamedTuple):
@@ -89,14 +89,14 @@ class Limits:
     min_spread: float = 0.01
     """Query outliers: lower bound of the relative standard deviation between packs of a type."""
     recent_days: int = 3
-    """Query failing: number of most recent days. A pack is reported if more than half of the days have a new input fault, and a cell
-    if it is faulty in more than half of the hours of these days."""
+    """Query failing: number of most recent days. A pack is reported if more than half of the days have a new input fault, and
+    a cell if it is faulty in more than half of the hours of these days."""
     weak_cell_soc: float = 0.03
-    """Query failing: minimum deviation of a cell's SOC below the mean of the cells, after subtraction of three standard deviations."""
+    """Query failing: minimum deviation of a cell's SOC below the mean of the cells, after subtraction of three std."""
     small_cell_ratio: float = 0.9
     """Query failing: upper limit of the capacity of a cell, relative to the median of the cells."""
     resistive_cell_ratio: float = 1.25
-    """Query failing: minimum resistance of a cell, relative to the median, after subtraction of two standard deviations."""
+    """Query failing: minimum resistance of a cell, relative to the median, after subtraction of two std."""
     self_discharge_c: float = MIN_SHORT_C
     """Query failing: minimum self-discharge of a cell above the median cell, as a C-rate [1/h]."""
     silent_hours: int = 2
@@ -242,7 +242,7 @@ def open_database(
         first = "" if days is None else _day_name(present.now_hour - 24 * (days - 1))
         valid_files = {day: files for day, files in files.items() if first <= day.name <= last}
         _create_hours_view(database, valid_files)
-        # without a last day: while the server's clock was ahead, rows arrived at later days
+        # also later days, at which rows arrived while the server's clock was ahead
         late = [str(file) for day, day_files in quarantined.items() if first <= day.name for file in day_files]
         _read_files(database, late).create_view("quarantined")
         _create_listed_packs(database, folder)
@@ -285,8 +285,8 @@ def _files_by_day(folder: Path) -> dict[Path, list[Path]]:
 def find_present(database: duckdb.DuckDBPyConnection, names: list[str], wall_hour: int) -> Present:
     """Return the present time. Usually only the statistics in the files are read.
 
-    A row that arrived after the present by the server's clock shows that a clock is wrong. It is this machine's clock if most
-    edges also are after the present; otherwise it is the server's, and the row's arrival is not used.
+    A row that arrived after the present by the server's clock shows that a clock is wrong. It is this machine's clock if the
+    clocks of most edges are later, too; otherwise it is the server's, and the row's arrival is not used.
 
     Args:
         database: Database.

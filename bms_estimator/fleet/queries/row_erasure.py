@@ -48,8 +48,8 @@ def erase_rows(folder: Path, packs: Collection[str]) -> int:
 def repair_arrivals(folder: Path, *, wall: Callable[[], float] = time.time) -> int:
     """Repair the rows that arrived while the server's clock was wrong. Return their number.
 
-    Their arrival becomes unknown, and they are moved out of quarantine. Rows whose hour is implausible by this machine's clock are
-    not changed.
+    Their arrival becomes unknown, and they are moved out of quarantine. Rows whose hour is implausible by this machine's clock
+    are not changed.
 
     Args:
         folder: Folder of the Parquet files.

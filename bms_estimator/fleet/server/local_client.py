@@ -27,7 +27,7 @@ async def connect(
     """
     host, port = client_address(node.nats)
     url = f"{scheme(node)}://{f'[{host}]' if ':' in host else host}:{port}"
-    tls = {"tls": _own_certificate(node.tls)} if node.tls else {}
+    tls = {"tls": _local_tls_context(node.tls)} if node.tls else {}
     credentials = {"user_credentials": credentials_file} if credentials_file else {}
     return await nats.connect(
         url,
@@ -44,7 +44,7 @@ async def _ignore(_: Exception) -> None:
     """Ignore an error, because the request that fails raises it, or the connection ends."""
 
 
-def _own_certificate(tls: Tls) -> ssl.SSLContext:
+def _local_tls_context(tls: Tls) -> ssl.SSLContext:
     """Return a TLS context that trusts the certificate of this machine's server under any name."""
     context = ssl.create_default_context(cafile=str(tls.cert))
     context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN

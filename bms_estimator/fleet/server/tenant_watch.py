@@ -1,4 +1,4 @@
-"""Watch over one tenant: heartbeats of its workers, its streams, undelivered messages, unsaved blocks, silent packs and alarms."""
+"""Watch over one tenant: its workers, its streams, undelivered messages, unsaved blocks, silent packs and alarms."""
 
 import asyncio
 import contextlib

@@ -1,7 +1,7 @@
 """Loop that processes the delivered messages of all partitions of a worker in turn, and the queue of each partition.
 
 The event loop runs between two slices of messages, not between two messages. Therefore the results of a slice are written to
-the server together, and a message needs no switch of tasks. The block loop processes the messages of a partition as long as its
+the server together, and a message needs no task switch. The block loop processes the messages of a partition as long as its
 state includes all earlier ones. All other messages need requests to the server, and are left to the task of the partition.
 """
 
@@ -58,14 +58,14 @@ class BlockLoop:
             queue = next(iter(self._ready))
             del self._ready[queue]
             if queue.process_next():
-                self._ready[queue] = None  # at the end
+                self._ready[queue] = None  # after the other partitions
             served.add(queue)
         return served
 
 
 SILENCE_S = 3.0
-"""Time without a delivery after which the stream is searched for further messages [s]. It exceeds the time in which another worker
-releases a partition."""
+"""Time without a delivery after which the stream is searched for further messages [s]. It exceeds the time in which another
+worker releases a partition."""
 
 
 class DeliveredMessages:

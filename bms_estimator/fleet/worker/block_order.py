@@ -101,9 +101,9 @@ class BlockPosition(NamedTuple):
 
 
 class UnsavedPositions:
-    """Positions of packs before the blocks that the last checkpoints do not include.
+    """Positions of the packs of a partition at its last snapshot and saves.
 
-    A pack that is not listed has had no block since.
+    A pack is listed only if it has received a block since. The position of any other pack is the present one.
     """
 
     def __init__(self) -> None:

@@ -52,7 +52,7 @@ NO_PEAK_A = 0.0
 """Peak current for ``write_usable_charge`` [A]. A worker does not store the peaks of the load. With 0, the mean current is
 used."""
 NO_CELL_STATES = np.zeros(0, CELL)
-"""States of no single cells."""
+"""Empty array of states of single cells."""
 NO_FORECAST_REASON = "a fleet worker makes no forecasts"
 
 

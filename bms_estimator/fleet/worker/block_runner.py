@@ -157,7 +157,7 @@ class BlockRunner:
         """
         async with self._step_lock:
             await asyncio.sleep(0)  # lets the event loop send heartbeats between two blocks
-            is_lethal = await self._guard.is_lethal(sequence)
+            is_lethal = await self._guard.begin_block(sequence)
             result = self._run_unguarded(pack, data, sequence, process_message, is_lethal=is_lethal)
             await self._guard.end_block(sequence)
         if is_lethal:

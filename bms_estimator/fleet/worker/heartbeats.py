@@ -28,7 +28,7 @@ MAX_LISTED = 20
 
 
 class HeartbeatReport:
-    """Maker of the heartbeats of one worker.
+    """Builder of the heartbeats of one worker.
 
     Args:
         name: Name of the worker.

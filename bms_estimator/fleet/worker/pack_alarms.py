@@ -128,7 +128,7 @@ class PackAlarms:
         return (*about_alarms, *(_event(text, now_s) for text in self._events(pack_type)))
 
     def _messages_of(self, k: int, pack_type: PackType, trace: TraceBlock, now_s: float) -> Iterator[AlarmMessage]:
-        """Yield the messages about alarm ``k``: events of this block, and its state. If it was raised and has ended, yield both states."""
+        """Yield the events of alarm ``k`` in this block, and its state; two states if it was raised and has ended."""
         state, definition = self._states[k], pack_type.alarms.by_position[k]
         entries = self._evaluation.entries
         changes = {int(entry["kind"]): entry for entry in entries[entries["alarm"] == k]}  # the last one of each kind

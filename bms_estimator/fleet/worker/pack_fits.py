@@ -140,7 +140,7 @@ class PackFits:
             slow_fit.estimator.schedule(h["elapsed_s"] + ADOPT_DELAY_S)
 
     def _adopt(self, slow_fit: WorkerFit) -> None:
-        """Adopt the received fit, unless the filter knows the SOC better. After an exception, the previous fit stays in force."""
+        """Adopt the received fit, unless the filter's SOC is more certain. After an exception, the previous fit stays in force."""
         received, estimator = self._fit["received"], slow_fit.estimator
         if not received["min_filter_std"] <= self._filter["soc_std"]:
             return
@@ -155,7 +155,7 @@ class PackFits:
             self._counters["fits"] += 1
 
     def _send_rows(self, slow_fit: WorkerFit, *, is_request: bool = False) -> None:
-        """Send the completed rows, and a request for a fit of all rows so far."""
+        """Send the completed rows; with ``is_request``, also request a fit of all rows so far."""
         rows = slow_fit.estimator.take_rows()
         position, identity = RowsPosition(self._sequence, len(self._messages)), f"{self._pack}.{self._sequence}"
         data = encode_rows(Rows(rows, position, self._digest))

@@ -73,7 +73,7 @@ def cell_layout(cells: int) -> str:
 
 @lru_cache(maxsize=2 * MAX_CELLS)
 def cell_count(layout: str) -> int:
-    """Return the number of single cells of this version's records with this layout; 0 for any other layout."""
+    """Return the number of single cells in a layout of this version; 0 without single cells, or for another version."""
     fields = {name: shape for name, _, shape in json.loads(layout)}
     (cells,) = fields.get(CELLS) or (0,)
     return cells if 0 < cells <= MAX_CELLS and cell_layout(cells) == layout else 0

@@ -102,7 +102,7 @@ FIT = np.dtype(
         ("received", PACK_FIT),
         # 1: ``weakest`` is known
         ("has_weakest", "i8"),
-        # weakest cell of a bank by the last fits
+        # weakest cell of a bank according to the last fits
         ("weakest", COMPARED),
     ],
     align=True,

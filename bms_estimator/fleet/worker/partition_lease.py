@@ -1,4 +1,4 @@
-"""Lease of one partition by a worker: take-over, processing of messages, checkpoints, release.
+"""Lease of one partition by a worker: takeover, processing of messages, checkpoints, release.
 
 The state depends only on the order of the stream. Therefore the sequence number of the last processed message defines the state.
 Messages that were delivered to another worker, or lost in transit, are read from the stream. The stream is also read after
@@ -62,8 +62,8 @@ class PartitionLease:
         claim: Claim of this worker; None while it has none.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
-        refused_format: Format of the last checkpoint if this worker cannot read it, and therefore refuses the partition; otherwise
-            None.
+        refused_format: Format of the last checkpoint if this worker cannot read it, and therefore refuses the partition;
+            otherwise None.
     """
 
     def __init__(

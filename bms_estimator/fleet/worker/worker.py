@@ -103,7 +103,7 @@ async def work(options: Options, stop: asyncio.Event) -> None:
     """
     notifier = SystemdNotifier([options.name])
     starting = asyncio.ensure_future(_start(options, notifier))
-    # a stop cancels only ``wait``, so that ``starting.done()`` shows below if the worker was created
+    # a stop cancels only ``asyncio.wait``; therefore ``starting`` is done only if the worker was created
     await until_first_ends(asyncio.wait([starting]), stop.wait())
     if not starting.done():
         await end(starting)

@@ -30,30 +30,30 @@ async def claim_guarded(store: CheckpointStore) -> ReplayGuard:
 async def test_block_in_which_several_holders_died_is_lethal(store: CheckpointStore) -> None:
     guard = await claim_guarded(store)
     for _ in range(MAX_DEATHS):
-        assert not await guard.is_lethal(5)
+        assert not await guard.begin_block(5)
         guard = await claim_after_a_death(store)
-    assert await guard.is_lethal(5)
-    assert not await guard.is_lethal(6)
+    assert await guard.begin_block(5)
+    assert not await guard.begin_block(6)
 
 
 async def test_block_that_its_holders_survived_is_not_lethal(store: CheckpointStore) -> None:
     guard = await claim_guarded(store)
     for _ in range(MAX_DEATHS + 1):
-        assert not await guard.is_lethal(5)
+        assert not await guard.begin_block(5)
         await guard.end_block(5)  # the holder dies later, from another cause
         guard = await claim_after_a_death(store)
 
 
 async def test_blocks_after_the_replay_are_not_written_down(store: CheckpointStore) -> None:
     guard = await claim_guarded(store)
-    assert not await guard.is_lethal(END_SEQUENCE + 1)
+    assert not await guard.begin_block(END_SEQUENCE + 1)
     assert (await store.replays.read(0)).sequence == 0
 
 
 async def test_guarded_replay_does_not_wait_for_the_leader_of_the_bucket(nc: Client, store: CheckpointStore) -> None:
     guard = await claim_guarded(store)
     await nc.jetstream().delete_stream(f"KV_{subjects.CHECKPOINTS_BUCKET}")
-    assert not await guard.is_lethal(5)
+    assert not await guard.begin_block(5)
 
 
 @pytest.mark.parametrize("is_saved", [True, False], ids=["after a checkpoint", "after an orderly release"])
@@ -65,5 +65,5 @@ async def test_replay_is_not_guarded(store: CheckpointStore, is_saved: bool) -> 
     else:
         await store.claims.record_release(claim)
     guard = await claim_after_a_death(store)
-    assert not await guard.is_lethal(5)
+    assert not await guard.begin_block(5)
     assert (await store.replays.read(0)).sequence == 0

@@ -238,7 +238,7 @@ async def _erase_states(nc: Client, store: CheckpointStore, partition: int, pack
 async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: dict[str, int]) -> None:
     """Rewrite the checkpoints that contain one of the packs of ``counts``, and count them there.
 
-    Damaged checkpoints are removed, and those of a version that this one cannot read, except the newest intact one.
+    Damaged checkpoints and those of an unreadable version are removed. The newest intact one must be readable.
 
     Raises:
         FencedError: A worker has claimed the partition meanwhile.
@@ -266,7 +266,7 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
         for pack in found:
             counts[pack] += 1
     for info in checkpoints:
-        if info not in readable:  # it may contain the packs
+        if info not in readable:  # an unreadable checkpoint may contain the packs
             claim = await store.replace(claim, info, None)
 
 

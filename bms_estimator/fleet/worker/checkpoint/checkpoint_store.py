@@ -107,10 +107,10 @@ class CheckpointStore:
         self._damaged: set[str] = set()  # names of damaged objects that this worker has found
 
     async def claim(self, partition: int) -> Claim:
-        """Take over a partition from its present owner, if any, and remove its objects that the pointer does not name.
+        """Take over a partition from its present owner, if any. Remove objects of the partition that the pointer does not name.
 
-        Such objects remain after an unfinished write, and after a roll-back to a version without daily checkpoints or increments,
-        which it leaves out of the pointer.
+        Such objects remain after an unfinished write, and after a roll-back to a version that drops daily checkpoints or
+        increments from the pointer.
 
         Raises:
             FencedError: Another worker has claimed it at the same time.

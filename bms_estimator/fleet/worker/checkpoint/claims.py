@@ -123,7 +123,7 @@ class Claims:
         """Return the pointer of a partition; None without one.
 
         Raises:
-            UnreadableFormatError: The pointer is not one of this version, or the last checkpoint has a format that this version
+            UnreadableFormatError: This version cannot decode the pointer, or the last checkpoint has a format that this version
                 cannot read.
         """
         stored = await self._read(partition)
@@ -140,7 +140,7 @@ class Claims:
             FencedError: Another worker has taken the partition over.
         """
         stored = await self._read(claim.partition)
-        if stored is None and await self._has_lost(claim):
+        if stored is None and await self._is_bucket_recreated(claim):
             log.error("the server has lost its checkpoints: the state is saved again", partition=claim.partition)
             return Claim(claim.partition, 0, CheckpointPointer(worker=self._worker, next=claim.pointer.next))
         if stored is None or stored.revision <= claim.revision:  # a lower revision comes from a lagging node
@@ -149,8 +149,8 @@ class Claims:
             return Claim(claim.partition, stored.revision, stored.pointer)
         raise FencedError(stored.pointer.worker)
 
-    async def _has_lost(self, claim: Claim) -> bool:
-        """Return True if the bucket is a new one, which ends before the revision of a claim."""
+    async def _is_bucket_recreated(self, claim: Claim) -> bool:
+        """Return True if the bucket was recreated, so that it ends before the revision of a claim."""
         state = (await self._bucket.status()).stream_info.state
         return bool(claim.revision > state.last_seq)
 
@@ -191,7 +191,7 @@ class Claims:
         """Return the pointer of a partition; None without one.
 
         Raises:
-            UnreadableFormatError: The pointer is not one of this version.
+            UnreadableFormatError: This version cannot decode the pointer.
         """
         try:
             entry = await self._bucket.get(pointer_key(partition))
