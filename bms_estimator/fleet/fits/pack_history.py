@@ -72,7 +72,7 @@ class PackHistory:
         self.position, self._digest = max(position, self.position), digest
 
     def _add_rows(self, rows: NDArray[np.void], position: RowsPosition) -> None:
-        """Append rows that were not added before. After the return of a worker to an earlier checkpoint, replace the later rows."""
+        """Append rows that were not added before. After a worker's return to an earlier checkpoint, replace later rows."""
         before = self._history.rows
         if rows.size and before.size and rows["elapsed_s"][0] <= before["elapsed_s"][-1]:
             if position <= self.position:

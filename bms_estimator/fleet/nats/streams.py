@@ -1,8 +1,8 @@
 """Streams, buckets and consumers of one tenant.
 
 The stream ``RAW`` stores the blocks of samples that edges send, divided into partitions by pack. Each partition has a durable
-consumer, which the server pins to one worker at a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42). Key-value and object
-buckets are streams with the configuration that all clients give them (ADR-8, ADR-20).
+consumer, which the server pins to one worker at a time (https://github.com/nats-io/nats-architecture-and-design, ADR-42).
+Key-value and object buckets are streams with the configuration that all clients give them (ADR-8, ADR-20).
 """
 
 import asyncio

@@ -131,12 +131,12 @@ class BlockProcessor:
 
     def _restore_or_reset(self, pack_type: PackType, unmigrated_fields: Fields | None, block: Block) -> bool:
         """Adapt the pack's state to its present settings and this version, or reset it. Return True if it has changed."""
-        d, record = self._delivery, self._record[0]
-        is_same_config = _digest(d[CONFIG_DIGEST]) == pack_type.config_digest
+        delivery, record = self._delivery, self._record[0]
+        is_same_config = _digest(delivery[CONFIG_DIGEST]) == pack_type.config_digest
         if is_same_config and unmigrated_fields is None:
             return False
         has_state = bool(self._hour["store"])  # 0 before the first block
-        if _digest(d[STATE_DIGEST]) == pack_type.state_digest and has_state:
+        if _digest(delivery[STATE_DIGEST]) == pack_type.state_digest and has_state:
             saved = unmigrated_fields
             if saved is None:
                 saved = {name: v.copy() for name, v in fields(self._record["estimator"])}
@@ -155,11 +155,11 @@ class BlockProcessor:
         else:
             for name in ("flow", "hour", "fit", "estimator"):
                 record[name] = np.zeros((), PACK_STATE[name])
-            d[LAST_STORE_NS] = d["hour"] = d["clock_error_s"] = 0
+            delivery[LAST_STORE_NS] = delivery["hour"] = delivery["clock_error_s"] = 0
             self._unpacked.start_cells(0)
             self._counters["begun_anew"] += has_state
         self._fits.restart(pack_type)
-        d[CONFIG_DIGEST], d[STATE_DIGEST] = pack_type.config_digest, pack_type.state_digest
+        delivery[CONFIG_DIGEST], delivery[STATE_DIGEST] = pack_type.config_digest, pack_type.state_digest
         return True
 
     def _load_cells(self, pack_type: PackType) -> None:
@@ -222,13 +222,13 @@ class BlockProcessor:
 
     def _state_payload(self, pack_type: PackType, now_s: float) -> bytes | None:
         """Return the payload of topic ``state`` from the publish window; None if no sample was accepted."""
-        totals, window, d = pack_type.meter.update_totals(), self._window.take(), self._delivery
+        totals, window, delivery = pack_type.meter.update_totals(), self._window.take(), self._delivery
         for name, value in zip(ChargeEnergy._fields, totals, strict=True):
             self._charge_energy[name] = value
         if window is None:
             return None
         # ``blocks`` does not count the present block yet
-        counters = {"frames_received": int(d["blocks"]) + 1, "frames_lost": int(d["lost_blocks"])}
+        counters = {"frames_received": int(delivery["blocks"]) + 1, "frames_lost": int(delivery["lost_blocks"])}
         values = unknown_values()
         write_usable_charge(values, pack_type.estimator, pack_type.cutoff_v, NO_PEAK_A, pack_type.cells.deviations)
         forecast = Forecast(float(window.last["time_s"]), values, NO_FORECAST_REASON, None)
@@ -271,10 +271,12 @@ class BlockProcessor:
 
     def _gap_s(self, block: Block) -> float:
         """Return the length of the gap before a block [s]; infinite if unknown."""
-        d, times_s = self._delivery, _finite_times_s(block.samples)
-        if not d[LAST_STORE_NS] or not times_s.size:
+        delivery, times_s = self._delivery, _finite_times_s(block.samples)
+        if not delivery[LAST_STORE_NS] or not times_s.size:
             return math.inf
-        gap_s = (block.store_created_ns - int(d[LAST_STORE_NS])) / 1e9 + (float(times_s[0]) - float(d["last_s"]))
+        gap_s = (block.store_created_ns - int(delivery[LAST_STORE_NS])) / 1e9 + (
+            float(times_s[0]) - float(delivery["last_s"])
+        )
         return gap_s if gap_s >= 0.0 else math.inf
 
     def _roll_over_hour(

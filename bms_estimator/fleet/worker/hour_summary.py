@@ -109,9 +109,15 @@ def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour
         sums: Sums of the hour; read only.
         estimator: Estimator with the pack's state at the hour's end; read only.
     """
-    h, record = sums[0], estimator.record[0]
+    hour_sums, record = sums[0], estimator.record[0]
     unknown = dict.fromkeys(Hour.model_fields)
-    values = unknown | _counts(h, record) | _measurements(h) | _observer_values(record) | _filter_values(estimator)
+    values = (
+        unknown
+        | _counts(hour_sums, record)
+        | _measurements(hour_sums)
+        | _observer_values(record)
+        | _filter_values(estimator)
+    )
     identity = {"pack": pack.name, "cell": pack.cell, "series": pack.series, "parallel": pack.parallel}
     return Hour.model_validate(
         {name: _finite(value) for name, value in values.items()}
@@ -120,26 +126,26 @@ def row(pack: PackSettings, hour: int, sums: Sums, estimator: Estimator) -> Hour
     )
 
 
-def _counts(h: np.void, record: np.void) -> dict[str, object]:
+def _counts(hour_sums: np.void, record: np.void) -> dict[str, object]:
     """Return counts, durations and totals."""
     return {
-        "samples": int(h["samples"]),
-        "dropped": int(h["dropped"]),
-        "outliers": int(record["counters"]["gated"] - h["outliers_before"]),
-        "searches": int(record["filter"]["reopened"] - h["searches_before"]),
-        "gaps": int(h["gaps"]),
-        "lost_blocks": int(h["lost_blocks"]),
-        "seen_s": float(h["seen_s"]),
-        "rest_s": float(h["rest_s"]),
-        "charge_out_ah": float(h["out_as"]) / HOUR_S,
-        "charge_in_ah": float(h["in_as"]) / HOUR_S,
-        "energy_out_wh": float(h["out_ws"]) / HOUR_S,
-        "energy_in_wh": float(h["in_ws"]) / HOUR_S,
+        "samples": int(hour_sums["samples"]),
+        "dropped": int(hour_sums["dropped"]),
+        "outliers": int(record["counters"]["gated"] - hour_sums["outliers_before"]),
+        "searches": int(record["filter"]["reopened"] - hour_sums["searches_before"]),
+        "gaps": int(hour_sums["gaps"]),
+        "lost_blocks": int(hour_sums["lost_blocks"]),
+        "seen_s": float(hour_sums["seen_s"]),
+        "rest_s": float(hour_sums["rest_s"]),
+        "charge_out_ah": float(hour_sums["out_as"]) / HOUR_S,
+        "charge_in_ah": float(hour_sums["in_as"]) / HOUR_S,
+        "energy_out_wh": float(hour_sums["out_ws"]) / HOUR_S,
+        "energy_in_wh": float(hour_sums["in_ws"]) / HOUR_S,
         "suspects": int(record["checks"]["suspects"]),
     }
 
 
-def _measurements(h: np.void) -> dict[str, object]:
+def _measurements(hour_sums: np.void) -> dict[str, object]:
     """Return means and extremes; empty if no sample was accepted."""
     values: dict[str, object] = {}
     for quantity, unit, count_field in (
@@ -147,22 +153,22 @@ def _measurements(h: np.void) -> dict[str, object]:
         ("current", "a", "samples"),
         ("temperature", "c", "temperatures"),
     ):
-        count = int(h[count_field])
+        count = int(hour_sums[count_field])
         if count:
-            values[f"{quantity}_{unit}"] = float(h[f"sum_{unit}"]) / count
-            values[f"{quantity}_min_{unit}"] = float(h[f"min_{unit}"])
-            values[f"{quantity}_max_{unit}"] = float(h[f"max_{unit}"])
-    if h["samples"] and math.isfinite(h["min_margin"]):
-        values["stability_margin_min"] = float(h["min_margin"])
-    if h["innovations"]:
-        values["innovation_rms_v"] = math.sqrt(h["sum_innovation_v2"] / h["innovations"])
+            values[f"{quantity}_{unit}"] = float(hour_sums[f"sum_{unit}"]) / count
+            values[f"{quantity}_min_{unit}"] = float(hour_sums[f"min_{unit}"])
+            values[f"{quantity}_max_{unit}"] = float(hour_sums[f"max_{unit}"])
+    if hour_sums["samples"] and math.isfinite(hour_sums["min_margin"]):
+        values["stability_margin_min"] = float(hour_sums["min_margin"])
+    if hour_sums["innovations"]:
+        values["innovation_rms_v"] = math.sqrt(hour_sums["sum_innovation_v2"] / hour_sums["innovations"])
     return values
 
 
 def _observer_values(record: np.void) -> dict[str, object]:
     """Return the observer's values; empty before the pack's first sample."""
-    s = record["observer"]
-    return {name: float(s[name]) for name in ("soc", "delta_1", "delta_2")} if s["started"] else {}
+    observer = record["observer"]
+    return {name: float(observer[name]) for name in ("soc", "delta_1", "delta_2")} if observer["started"] else {}
 
 
 class _Element(NamedTuple):
@@ -183,8 +189,8 @@ _ELEMENTS = (
 def _filter_values(estimator: Estimator) -> dict[str, object]:
     """Return the filter's values; empty without a filter and before its first sample."""
     record, settings = estimator.record[0], estimator.settings_record[0]
-    f = record["filter"]
-    if not (estimator.identifying and f["started"]):
+    filter_state = record["filter"]
+    if not (estimator.identifying and filter_state["started"]):
         return {}
     capacity, offset, r_s = (
         relative_capacity(record),
@@ -192,8 +198,8 @@ def _filter_values(estimator: Estimator) -> dict[str, object]:
         relative_series_resistance(record, settings, estimator.cell_file_settings),
     )
     values: dict[str, object] = {
-        "soc_std": float(weakest_cell_soc_std(f, settings["filter"])),
-        "soc_mean_std": float(f["soc_std"]),
+        "soc_std": float(weakest_cell_soc_std(filter_state, settings["filter"])),
+        "soc_mean_std": float(filter_state["soc_std"]),
         "capacity_ratio": capacity.value,
         "capacity_ratio_std": capacity.std,
         "capacity_first_std": float(settings["filter"]["capacity_std"]),
@@ -203,7 +209,7 @@ def _filter_values(estimator: Estimator) -> dict[str, object]:
         "r_s_ratio_std": r_s.std,
         "r_s_unlearned_s": r_s.age_s,
     }
-    covariance = f["covariance"][f["best"]]
+    covariance = filter_state["covariance"][filter_state["best"]]
     for name, (j, k) in _CORRELATIONS.items():
         values[name] = _correlation(covariance, j, k)
     for element in _ELEMENTS:

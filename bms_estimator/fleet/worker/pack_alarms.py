@@ -1,7 +1,7 @@
 """Alarms and events of the pack whose record is loaded, evaluated with each block.
 
-A worker has neither a link to the source nor hooks nor forecasts. Therefore it does not evaluate ``collapse_risk``, ``hook_failed``
-and ``alarm_state_lost``, and raises ``link_lost`` for a gap when the next samples arrive. No alarm latches.
+A worker has neither a link to the source nor hooks nor forecasts. Therefore it does not evaluate ``collapse_risk``,
+``hook_failed`` and ``alarm_state_lost``, and raises ``link_lost`` for a gap when the next samples arrive. No alarm latches.
 """
 
 import math

@@ -91,10 +91,10 @@ class PackFits:
 
     def advance(self, slow_fit: WorkerFit) -> None:
         """Send completed rows, and request or adopt a fit that is due."""
-        h = self._history
-        if h["elapsed_s"] >= h["event_s"]:
+        history = self._history
+        if history["elapsed_s"] >= history["event_s"]:
             self._handle_event(slow_fit)
-        elif h["count"] >= FULL_ROWS:
+        elif history["count"] >= FULL_ROWS:
             self._send_rows(slow_fit)
 
     def take_messages(self) -> tuple[QueuedMessage, ...]:
@@ -109,7 +109,7 @@ class PackFits:
             sequence: Stream sequence number of its message.
             pack_type: Type of the pack.
         """
-        fit, h, slow_fit = self._fit, self._history, pack_type.pack.slow_fit
+        fit, history, slow_fit = self._fit, self._history, pack_type.pack.slow_fit
         if not isinstance(slow_fit, WorkerFit) or fit["request"] != result.request:
             return False
         if not result.is_fitted:
@@ -119,28 +119,28 @@ class PackFits:
             return True
         write_fit(fit["received"], result, sequence)
         write_weakest(fit, result)
-        if h["event_s"] > fit["begun_s"] + ADOPT_DELAY_S:
-            slow_fit.estimator.schedule(h["elapsed_s"])  # a late result is adopted at the next sample
+        if history["event_s"] > fit["begun_s"] + ADOPT_DELAY_S:
+            slow_fit.estimator.schedule(history["elapsed_s"])  # a late result is adopted at the next sample
         return True
 
     def _handle_event(self, slow_fit: WorkerFit) -> None:
         """Adopt the received fit; or request a fit, unless an unanswered request is younger than the interval between fits."""
-        fit, h = self._fit, self._history
+        fit, history = self._fit, self._history
         due_s = fit["begun_s"] + ADOPT_DELAY_S
         if fit["received"]["sequence"]:
             self._adopt(slow_fit)
             fit["request"], fit["received"] = 0, np.zeros((), PACK_FIT)
             slow_fit.estimator.schedule(due_s + (slow_fit.interval() - ADOPT_DELAY_S))
-        elif fit["request"] and h["event_s"] == due_s:
+        elif fit["request"] and history["event_s"] == due_s:
             self._counters["late_fits"] += 1
             slow_fit.estimator.schedule(due_s + slow_fit.interval())
         else:
             self._send_rows(slow_fit, is_request=True)
-            fit["request"], fit["begun_s"] = self._sequence, h["elapsed_s"]
-            slow_fit.estimator.schedule(h["elapsed_s"] + ADOPT_DELAY_S)
+            fit["request"], fit["begun_s"] = self._sequence, history["elapsed_s"]
+            slow_fit.estimator.schedule(history["elapsed_s"] + ADOPT_DELAY_S)
 
     def _adopt(self, slow_fit: WorkerFit) -> None:
-        """Adopt the received fit, unless the filter's SOC is more certain. After an exception, the previous fit stays in force."""
+        """Adopt the received fit, unless the filter's SOC is more certain. After an error, the previous fit stays in force."""
         received, estimator = self._fit["received"], slow_fit.estimator
         if not received["min_filter_std"] <= self._filter["soc_std"]:
             return

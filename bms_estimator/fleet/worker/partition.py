@@ -264,12 +264,12 @@ class Partition:
         """Process a block of a known pack, or skip a lethal one, of which only the header was decoded."""
         records = self._records
         unmigrated_fields = records.load(pack)
-        d = records.unpacked.delivery
-        stored_lost = int(d["lost_blocks"])
+        delivery = records.unpacked.delivery
+        stored_lost = int(delivery["lost_blocks"])
         records.load_unmigrated_delivery(pack)
-        self._unsaved.add(pack, position(d))
-        order = classify_block(d, block)
-        newly_lost = int(d["lost_blocks"]) - stored_lost  # since the record was stored
+        self._unsaved.add(pack, position(delivery))
+        order = classify_block(delivery, block)
+        newly_lost = int(delivery["lost_blocks"]) - stored_lost  # since the record was stored
         records.unpacked.count_lost(newly_lost)
         if order is BlockOrder.NEXT:
             result = self._process_next(pack, block, arrival, pack_type, unmigrated_fields, newly_lost)
@@ -283,8 +283,8 @@ class Partition:
             records.store_unmigrated_delivery(pack)
         is_first = pack not in self._replied
         self._replied.add(pack)
-        safe = self._unsaved.safe(pack, position(d))
-        return result._replace(reply=edge_reply(order, int(d["ahead"]), block, safe, is_first=is_first))
+        safe = self._unsaved.safe(pack, position(delivery))
+        return result._replace(reply=edge_reply(order, int(delivery["ahead"]), block, safe, is_first=is_first))
 
     def _process_next(
         self,
@@ -317,15 +317,15 @@ class Partition:
         else:
             result, skip_counter = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR), "failed"
         records = self._records
-        d = records.unpacked.delivery
+        delivery = records.unpacked.delivery
         if skip_counter:
             records.load(pack)  # an internal error may have changed the record
             records.load_unmigrated_delivery(pack)
-            classify_block(d, block)
+            classify_block(delivery, block)
             records.unpacked.count_lost(newly_lost)
             self._counters[skip_counter] += 1
-        mark_processed(d)
-        self._update_clock_error(pack, float(d["clock_error_s"]))
+        mark_processed(delivery)
+        self._update_clock_error(pack, float(delivery["clock_error_s"]))
         return result
 
     def _update_clock_error(self, pack: str, error_s: float) -> None:

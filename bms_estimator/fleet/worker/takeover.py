@@ -1,9 +1,9 @@
 """Takeover of a partition: restoration from its checkpoints, and detection of blocks that kill workers.
 
-A crash or an endless loop in native code gives a worker no chance to report the block. A worker that takes over a partition
-reads the stream from the last checkpoint, and therefore processes the block again. The pointer to the checkpoints counts the
-claims since the last checkpoint. From claim ``GUARDED_CLAIMS`` on, the worker sends the sequence number of each block of the replay
-to the server before it processes the block. If the worker dies, the next owner thereby finds the block that was being processed. A
+A crash or an endless loop in native code gives a worker no chance to report the block. A worker that takes over a partition reads
+the stream from the last checkpoint, and therefore processes the block again. The pointer to the checkpoints counts the claims
+since the last checkpoint. From claim ``GUARDED_CLAIMS`` on, the worker sends the sequence number of each block of the replay to
+the server before it processes the block. If the worker dies, the next owner thereby finds the block that was being processed. A
 block that was found ``MAX_DEATHS`` times is lethal, and is skipped.
 """
 
