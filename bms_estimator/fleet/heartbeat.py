@@ -44,13 +44,13 @@ class Heartbeat(BaseModel):
     packs: int = 0
     """Number of packs in the claimed partitions."""
     blocks: int = 0
-    """Number of processed blocks since the worker's start."""
+    """Number of processed blocks."""
     samples: int = 0
-    """Number of processed samples since the worker's start."""
+    """Number of processed samples."""
     faults: int = 0
-    """Number of blocks skipped because of an internal error since the worker's start; the log has the tracebacks."""
+    """Number of blocks skipped because of an internal error; the log has the tracebacks."""
     dead_letters: int = 0
-    """Number of blocks that became dead letters since the worker's start (``nats.dead_letters``)."""
+    """Number of blocks that became dead letters (``nats.dead_letters``)."""
     lag_s: float | None = None
     """Largest lag since the previous heartbeat [s]: time from the arrival of a block's last sample at the edge to the
     processing of the block. None without a block."""
@@ -76,12 +76,12 @@ class Heartbeat(BaseModel):
     checkpoint_s: float | None = None
     """Duration of the last written checkpoint [s]; None without one."""
     cpu_s: float = 0.0
-    """CPU time of the process since its start [s]."""
+    """CPU time of the process [s]."""
     estimation_s: float = 0.0
-    """CPU time of the estimation of blocks since the worker's start [s]; part of ``cpu_s``."""
+    """CPU time of the estimation of blocks [s]; part of ``cpu_s``."""
     rss_mib: float = 0.0
     """Memory of the process [MiB]."""
     reconnects: int = 0
-    """Number of reconnections to the server since the worker's start."""
+    """Number of reconnections to the server."""
     trouble: str = ""
     """Description of the present error; empty without an error."""

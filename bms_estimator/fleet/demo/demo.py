@@ -131,6 +131,7 @@ async def run_demo(demo: Demo, stop: asyncio.Event) -> None:
 
 
 async def _run_steps(demo: Demo, processes: Processes, stack: contextlib.AsyncExitStack) -> None:
+    """Run the steps of the demo."""
     # in the past, because the edges are faster than real time, and must not get ahead of the server's clock, even if two steps
     # take until their timeouts
     begin_s = int(time.time() - SPEED * (demo.seconds + 2.0 * TIMEOUT_S)) - BLOCK_S

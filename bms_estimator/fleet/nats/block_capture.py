@@ -116,6 +116,7 @@ class BlockCapture:
             yield _concatenated(parts)
 
     def _parts(self, cells: int) -> Iterator[tuple[SampleBlock, CellBlock]]:
+        """Yield the results of ``samples_with_cells`` block by block."""
         store, first_store, offset_s, last_s = 0, 0, 0.0, 0.0  # store 0: none yet
         for key in sorted(self._blocks):
             block = self._block(key)

@@ -152,13 +152,8 @@ class PackTypes:
         self._types: dict[tuple[int, int], tuple[Settings, PackModel, PackType]] = {}
 
     def of(self, settings: Settings, cell: PackModel) -> PackType:
-        """Return the type of packs with these settings; cached by the identity of both objects.
-
-        Args:
-            settings: Settings of the packs.
-            cell: Model of a whole pack.
-        """
-        key = id(settings), id(cell)  # not reused, because the cached tuple keeps both objects alive
+        """Return the type of packs with these settings and this model; cached by the identity of both objects."""
+        key = id(settings), id(cell)  # unique, because the cached tuple keeps both objects alive
         if key not in self._types:
             if len(self._types) >= MAX_TYPES:
                 self._types.clear()
@@ -199,12 +194,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], adv
 
 
 def type_estimator(settings: Settings, cell: PackModel) -> Estimator:
-    """Return the estimator of packs with these settings, shared by all partitions of a process.
-
-    Args:
-        settings: Settings of the packs.
-        cell: Model of a whole pack.
-    """
+    """Return the estimator of packs with these settings and this model, shared by all partitions of a process."""
     return _estimator(_EstimatorKey(config_digest(settings, cell), settings, cell))
 
 

@@ -113,6 +113,7 @@ class FleetFeed:
         await asyncio.gather(self._poll_table(self._nc), self._read_recent_hours(self._nc))
 
     def _handlers(self) -> dict[str, Callable[[Msg], Coroutine[Any, Any, None]]]:
+        """Return the message handlers by subject."""
         view, clock = self._view, time.monotonic
 
         async def state(message: Msg) -> None:

@@ -85,7 +85,7 @@ def edge_tokens(
         folder: Folder of the keys.
         tenant: Tenant of the packs.
         packs: Packs whose blocks the tokens allow to send.
-        now: Issue time; tokens issued before a configured time can be revoked.
+        now: Issue time.
         expires: Expiry time; None: never.
 
     Raises:

@@ -232,7 +232,7 @@ def user_token(
         account_key: The account's public key.
         role: Role of the user.
         name: Name of the user; for an edge the name of its pack.
-        issued: Issue time; tokens issued before a configured time can be revoked.
+        issued: Issue time (``Tenant.revoked``).
         expires: Expiry time; None: never.
     """
     claims = {"issuer_account": account_key, "type": "user"}
@@ -273,6 +273,7 @@ def _unlimited() -> dict[str, int]:
 
 
 def _signed(signer: Key, subject: str, name: str, claims: dict[str, Any], times: dict[str, int] | None = None) -> str:
+    """Return a signed JSON Web Token."""
     body = {"iss": signer.public, "sub": subject, "name": name, **(times or {})}
     token_id = hashlib.sha256(_json(body | {"nats": claims})).digest()
     body |= {"jti": base64.b32encode(token_id).rstrip(b"=").decode(), "nats": claims | {"version": _VERSION}}

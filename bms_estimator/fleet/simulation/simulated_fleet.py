@@ -156,7 +156,6 @@ class SimulatedFleet:
 
     Attributes:
         names: Names of the packs.
-        begin_ns: Argument ``begin_ns``.
         store_created_ns: Creation time of each edge's store [ns since 1970], shape (packs,).
         truth: Ground truth of the packs.
     """

@@ -122,7 +122,7 @@ def _take_lag_s(leases: Sequence[PartitionLease]) -> float | None:
 
 
 def _rss_mib() -> float:
-    resident_pages = int(Path("/proc/self/statm").read_text().split()[1])  # second field
+    resident_pages = int(Path("/proc/self/statm").read_text().split()[1])
     return resident_pages * resource.getpagesize() / 2**20
 
 
