@@ -445,7 +445,7 @@ def with_capacity(cell: CellModel, capacity_ah: float, relative_std: float | Non
 
 
 def fitted_to(cell: CellModel, captures: Sequence[str], grade: Grade | None = None) -> CellModel:
-    """Return the cell with the digests of the captures that it was fitted to, beside those of the cell it began with.
+    """Return the cell with the digests of the captures that it was fitted to, in addition to those that it has.
 
     Args:
         cell: The cell.
