@@ -50,7 +50,8 @@ error."""
 FLAT_SOC = (0.1, 0.9)
 """SOC range of the mean slope of the OCV curve, without its steep ends."""
 STEEP_RATIO = 4.0
-"""Minimum slope of the OCV curve near full, relative to the mean slope, of a steep curve. LFP reaches 100, NMC reaches 2."""
+"""Minimum slope of the OCV curve near full, relative to the mean slope, of a steep curve. The generic LFP cell has 144, the
+generic NMC cell 1.8."""
 KNEE_SOC = 0.02
 """Std of the SOC at which the OCV curve of a single cell falls near empty."""
 HOUR_S = 3600.0
