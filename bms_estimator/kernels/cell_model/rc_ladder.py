@@ -24,8 +24,8 @@ HIGH_ACTIVATION_ENERGY = 45e3
 """Activation energy of the strong part of each resistance [J/mol]. This part depends strongly on temperature, like those of
 reaction and diffusion."""
 HYSTERESIS_ACTIVATION_ENERGY = 8e3
-"""Activation energy of the hysteresis [J/mol]: the hysteresis between C/30 curves of an LFP cell, without the drop of
-its RC network, was 1.2 and 1.7 times as large at 5 and -15 C as at 25 C."""
+"""Activation energy of the hysteresis [J/mol]. Between C/30 curves of an LFP cell, less the drop of its RC network, the
+hysteresis at 5 and -15 C was 1.2 and 1.7 times that at 25 C."""
 GAS_CONSTANT = 8.314462618
 """Molar gas constant [J/(mol K)]."""
 REFERENCE_C = 25.0

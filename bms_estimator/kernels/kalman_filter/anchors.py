@@ -217,8 +217,8 @@ def full_std(f: Record, ekf: Record, current_a: float, below_v: float) -> float:
     """Return the std of the SOC at the end of a charge with ``current_a`` [A], ``below_v`` below the charger's voltage [V].
 
     It consists of ``FULL_STD``, of the SOC that is missing to 1 according to the voltage without the overpotential, and of the
-    SOC by which the particles' interiors lag behind. The missing SOC is not subtracted, because the charge that defined SOC 1 of
-    the cell file may have ended at another current than the owner's, and the source may report too low a voltage.
+    SOC by which the particles' interiors lag behind. The missing SOC is not subtracted. The charge that defined SOC 1 of the cell
+    file may have ended at another current, or the source may report too low a voltage.
     """
     open_v = ocv(1.0, ekf.ocv_v, ekf.ocv_slope_v) - below_v + overpotential(f, ekf, 1.0, current_a)
     missing_soc = 1.0 - soc_from_ocv(open_v, ekf.ocv_v, ekf.ocv_slope_v)
