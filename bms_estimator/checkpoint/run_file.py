@@ -67,7 +67,7 @@ class RunCounters:
         clean: True if the last run ended without a crash or kill; False while it runs.
         alarms: State of the alarms, in the format of ``AlarmEvaluator.saved_state``.
         hooks: Hashes of the alarm hooks without unfinished or failed jobs at a clean end; None: unknown.
-        cell_slots: Slots of the cells (``CellSlots.known``).
+        cell_slots: Slots of the cells (``CellSlots.cell_indices``).
     """
 
     restarts: int

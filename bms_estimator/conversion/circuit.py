@@ -21,7 +21,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     HYSTERESIS_ACTIVATION_ENERGY,
     LOW_ACTIVATION_ENERGY,
     TAU_S,
-    TREND,
+    TREND_PAIR,
     weak_share,
 )
 from bms_estimator.kernels.kalman_filter.records import Noise
@@ -138,7 +138,7 @@ def c_header(cell: CellModel) -> str:
         pairs=BRANCHES,
         ocv_nodes=curve.soc.size,
         ohm_nodes=ladder.soc.size,
-        trend=TREND,
+        trend=TREND_PAIR,
         weak_k=_float(LOW_ACTIVATION_ENERGY / GAS_CONSTANT),
         strong_k=_float(HIGH_ACTIVATION_ENERGY / GAS_CONSTANT),
         hysteresis_k=_float(HYSTERESIS_ACTIVATION_ENERGY / GAS_CONSTANT),

@@ -13,36 +13,36 @@ from bms_estimator.settings.sampling import ChargeLimits
 VOLTAGE_ERROR = 0.005
 """Relative error of the voltage of charger and source. A BMS seldom measures the voltage of a pack more accurately."""
 NEARLY_FULL_SOC = 0.995
-"""SOC whose OCV limits the default full voltage. Where the curve is steep, ``VOLTAGE_ERROR`` alone would leave a too high voltage:
+"""SOC whose OCV limits the default full voltage. On a steep curve, ``VOLTAGE_ERROR`` alone would give too high a voltage:
 chargers of LFP cells end between 3.5 and 3.65 V, within 0.4 % of SOC."""
 TAIL_C = 0.05
 """Default tail current, as a C-rate. At C/20 the overpotential is about 10 mV, which is 1 % of SOC in oxide cells."""
 MAX_END_C = 0.125
 """Maximum current at which a charge may end with the default tail current, as a C-rate. Chargers end at C/50 to C/10."""
 MAX_STEEP_END_C = 0.25
-"""``MAX_END_C`` of a cell in which the overpotential of this current hides less than ``FULL_STD``, because the curve is steep when
-full. The voltage of such a cell is constant for less than ``AT_FULL_S`` if a charge with C/5 ends at C/10."""
+"""``MAX_END_C`` of a cell in which the overpotential of this current hides less than ``FULL_STD``, because the curve is steep
+when full. The voltage of such a cell is constant for less than ``AT_FULL_S`` if a charge with C/5 ends at C/10."""
 MAX_END_RATIO = 1.5
 """Maximum current at which a charge may end, in multiples of a configured tail current."""
 TRICKLE_C = 0.01
 """Minimum charge current, as a C-rate. It exceeds the std of a current sensor's offset (``Noise.offset_c``). It is not C/50,
 because an LG M50 charges another 0.8 % between C/50 and C/100."""
 CUTOFF_MARGIN = 0.02
-"""Relative margin of the cut-off voltage. Near empty the voltage falls by about 50 mV between two samples of a slow source. This
-fall is less than 0.2 % of SOC."""
+"""Relative margin of the cut-off voltage. Near empty the voltage falls by about 50 mV between two samples of a slow source, which
+is less than 0.2 % of SOC."""
 MIN_FULL_SOC = 0.98
 """Minimum SOC of the OCV curve at the full voltage for a correction of the filter: 2 std of the anchor below 1."""
 MAX_EMPTY_SOC = 0.05
 """Maximum SOC of the OCV curve at the cut-off voltage for a correction of the filter: 1.5 std of the anchor at 25 C."""
 MIN_USED_SOC = 0.5
-"""Minimum SOC of a generic curve between the configured voltages. With less they are rather those of another pack or unit."""
+"""Minimum SOC range of a generic curve between the configured voltages. In a smaller range, one of them is probably wrong."""
 
 
 def between_limits(pack: CellModel, limits: ChargeLimits) -> CellModel:
     """Return a generic model with SOC 0 and 1 at the configured voltages of protection and charger.
 
-    The declared capacity is that between these voltages. The file of a measured cell remains unchanged, because its capacity belongs
-    to its own ends.
+    The declared capacity is that between these voltages. The file of a measured cell remains unchanged, because its capacity is
+    that between its own end voltages.
     """
     ocv, ladder = pack.ocv, pack.ladder
     if ladder is None or ladder.std <= INDEPENDENT_R_STD or not isinstance(ocv, TableOcv):
@@ -52,19 +52,23 @@ def between_limits(pack: CellModel, limits: ChargeLimits) -> CellModel:
     if high - low < MIN_USED_SOC or high - low == 1.0:
         return pack
     soc = np.array([0.0, *(s for s in (np.array(ocv.soc) - low) / (high - low) if 0.0 < s < 1.0), 1.0])
-    at = low + (high - low) * soc
+    generic_soc = low + (high - low) * soc
     columns = {
-        name: tuple(np.interp(at, ocv.soc, column).tolist())
+        name: tuple(np.interp(generic_soc, ocv.soc, column).tolist())
         for name in ("error_v", "hysteresis_v", "per_kelvin_v")
         if (column := getattr(ocv, name)) is not None
     }
     new_ocv = ocv.model_copy(
-        update={"soc": tuple(soc.tolist()), "ocv_v": tuple(MonotoneCubic(ocv.soc, ocv.ocv_v)(at).tolist()), **columns}
+        update={
+            "soc": tuple(soc.tolist()),
+            "ocv_v": tuple(MonotoneCubic(ocv.soc, ocv.ocv_v)(generic_soc).tolist()),
+            **columns,
+        }
     )
     ladder_soc = np.linspace(0.0, 1.0, len(ladder.soc))
-    at = low + (high - low) * ladder_soc
+    generic_soc = low + (high - low) * ladder_soc
     rows = {
-        name: tuple(tuple(np.interp(at, ladder.soc, row).tolist()) for row in getattr(ladder, name))
+        name: tuple(tuple(np.interp(generic_soc, ladder.soc, row).tolist()) for row in getattr(ladder, name))
         for name in ("weak_ohm", "strong_ohm")
     }
     new_ladder = ladder.model_copy(update={"soc": tuple(ladder_soc.tolist()), **rows})

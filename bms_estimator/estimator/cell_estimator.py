@@ -1,4 +1,4 @@
-"""Estimator of the single cells of a pack whose cell voltages are measured, beside the estimator of the pack."""
+"""Estimator of the single cells of a pack with cell voltages. It uses the results of the pack's estimator."""
 
 import math
 from collections.abc import Mapping
@@ -94,7 +94,7 @@ class CellEstimator:
         self._start(0)
 
     def _start(self, count: int) -> None:
-        """Begin without a state of ``count`` cells."""
+        """Begin with ``count`` cells before their first sample."""
         self.cells: Records = np.zeros(count, CELL)
         self.bank: Records = np.zeros(1, BANK_STATE)
         self._scratch = np.zeros(2 * count + STATES)
@@ -123,8 +123,8 @@ class CellEstimator:
 
         Args:
             samples: Samples, shape (n,), dtype SAMPLE.
-            cells_v: Cell voltages of the samples, shape (n, m) [V], with at most as many columns as cells in series; empty
-                without any.
+            cells_v: Cell voltages of the samples, shape (n, m) [V], with at most as many columns as cells in series; empty if
+                none are measured.
             trace: Estimates of the accepted samples.
         """
         if not self._enabled or not trace.size or not (cells_v.size or self.cells.size):
@@ -147,7 +147,7 @@ class CellEstimator:
 
     @property
     def _systematic_soc_std(self) -> float:
-        """Std of a cell's SOC by the constant part of its voltage error, which no average over time reduces."""
+        """Std of a cell's SOC due to the constant part of its voltage error, which no average over time reduces."""
         p = self._estimator.settings_record["filter"][0]
         low, high = (round(soc * (OCV_POINTS - 1)) for soc in MEAN_SLOPE_SOC)
         slope_v = (p["ocv_v"][high] - p["ocv_v"][low]) / p["series"] / (MEAN_SLOPE_SOC[1] - MEAN_SLOPE_SOC[0])

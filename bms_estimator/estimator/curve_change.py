@@ -29,9 +29,9 @@ def present_ohm(settings: np.void, f: np.void) -> Floats:
 
 
 def use_curves(f: np.void, settings: NDArray[np.void], curves: np.void) -> None:
-    """Replace the curves in the filter's settings, and keep R_s in ohm, which the filter stores relative to R_0 of the curves.
+    """Replace the curves in the filter's settings without a change of R_s in ohm.
 
-    R_s is the series resistance learned from current steps, and R_0 the series resistance of the curves.
+    R_s is the series resistance learned from current steps. The filter stores it relative to R_0 of the curves.
 
     Args:
         f: Record of dtype EKF_STATE.

@@ -10,8 +10,8 @@ from bms_estimator.settings.pack import Settings
 def load_cutoff_v(settings: Settings, cell: CellModel) -> float:
     """Return the terminal voltage at which the load is switched off, which ends the forecast [V].
 
-    It is the first known one of these: ``pack.cutoff_v``, ``pack.cutoff_voltage_v``, the limit of the alarm
-    ``pack_under_voltage``, and the OCV at SOC 0.
+    It is the first of these that is configured: ``pack.cutoff_v``, ``pack.cutoff_voltage_v``, the limit of the alarm
+    ``pack_under_voltage``; otherwise the OCV at SOC 0.
 
     Args:
         settings: Settings of the pack.

@@ -51,7 +51,7 @@ class Estimator:
         identifier: Settings of the identifier, the Kalman filter; None: only the adaptive observer runs.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
-        initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
+        initial_soc: SOC 0..1 at the first sample; None: from the voltage of the first sample by the OCV.
         sampling: Resolution, period and gain errors of the source; default: those of a board, with exact gains.
         limits: Limits of charger and protection; default: those of the cell file.
 
@@ -187,7 +187,7 @@ class Estimator:
             store_last_good_state(c, f)
 
     def add_prior(self, soc: float, std: float) -> None:
-        """Correct the SOC of a new pack by the SOC 0..1 that its device reports, with a std. Call this after the first sample."""
+        """Correct the SOC of a new pack by the SOC 0..1 that its device reports, with a std, after the first sample."""
         f, c = self.record[0]["filter"], self.record[0]["checks"]
         apply_prior(f, soc, std)
         self.state["soc"] = f["soc"]
@@ -217,7 +217,7 @@ class Estimator:
         store_last_good_state(checks, f)
 
     def load_exact(self, record: NDArray[np.void], settings_record: NDArray[np.void]) -> None:
-        """Return to copies of ``record`` and ``settings_record``, to the last bit."""
+        """Restore copies of ``record`` and ``settings_record``, bit by bit."""
         self.record[...], self.settings_record[...] = record, settings_record
 
     def schedule(self, event_s: float) -> None:
@@ -231,7 +231,7 @@ class Estimator:
         rows: NDArray[np.void] = h["rows"][: int(h["count"])].copy()
         if rows.size:
             h["count"] = 0
-            h["rows"] = np.zeros(1, HISTORY_ROW)  # unused rows would depend on the division of the samples into blocks
+            h["rows"] = np.zeros(1, HISTORY_ROW)  # stale rows would depend on the division of the samples into blocks
         return rows
 
     def discard_rows(self) -> None:
@@ -260,7 +260,7 @@ class Estimator:
         h["throughput_soc"] = h["row_as"] = h["hysteresis"] = 0.0
 
     def forget(self) -> None:
-        """Return to the cell file and to the state before the first sample, for another pack. The counters of the samples stay."""
+        """Return to the cell file and to the state before the first sample, for another pack. ``OBSERVER_COUNTERS`` remain."""
         self.return_to_cell_file()
         counters = {name: self.state[name].copy() for name in OBSERVER_COUNTERS}
         self.record[...] = np.zeros(1, ESTIMATOR_STATE)
@@ -321,7 +321,7 @@ def estimate(
     Args:
         capture: Rows of dtype ``SAMPLE``.
         cell: The pack as one two-terminal object (``CellModel.pack``).
-        initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
+        initial_soc: SOC 0..1 at the first sample; None: from the voltage of the first sample by the OCV.
         voltage_resolution_v: One step of the capture's voltage [V].
 
     Returns:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.kernels.cell_model.current_interpolation import PERIODS
+from bms_estimator.kernels.cell_model.current_interpolation import MAX_STEP_PERIODS
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANCES, TAU_S, weak_share
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, Noise
@@ -29,12 +29,12 @@ steep ends of the curve."""
 LEARNED_FRACTION = 0.97
 """Fraction of the OCV's error variance that is constant and is learned."""
 PLATEAU_SLOPE_V = 0.15
-"""Slope dOCV/dSOC per cell below which the OCV has a plateau [V]. There the voltage cannot distinguish an error of the curve from an
-error of the SOC, and the knees move. Only an error that is common to all SOCs is then learned."""
+"""Slope dOCV/dSOC per cell below which the OCV has a plateau [V]. There the voltage cannot distinguish an error of the curve from
+an error of the SOC, and the knees move. Only an error that is common to all SOCs is then learned."""
 MEASURED_STD_V = 2.0 * CURVE_ERROR_V
-"""Maximum std of the OCV of a measured cell [V]. A plateau with a larger std has a level that differs between makes. The square of
-the std of this level is the square of the smallest std of the curve, less the square of this constant. The A123 26650 is 11 mV
-above ``lfp``, with a std of 4 mV along the plateau."""
+"""Maximum std of the OCV of a measured cell [V]. A larger std on a plateau is due to a level that differs between makes. The
+variance of this level is the smallest variance of the curve, less the square of this constant. The A123 26650 is 11 mV above
+``lfp``, with a std of 4 mV along the plateau."""
 COMMON_CORRELATION = 0.9999
 """Correlation of the constant errors at two neighboring nodes of an OCV with a plateau. A correlation of 1 has no inverse."""
 CURVE_SOC = 0.3
@@ -56,10 +56,10 @@ ratios, which the scales LN_R0 and LN_R cannot correct."""
 ROOM_C = 15.0, 35.0
 """Lower and upper end of the temperature range of resistances without a declared range, as in a room [C]."""
 MIN_SOC_STD = 0.005
-"""Minimum std of the published SOC, because full and empty of a cell are not defined better."""
+"""Minimum std of the published SOC, because full and empty of a cell are not defined more precisely."""
 MIN_SOC_STD_OF_R_STD = 0.03
-"""Minimum std of the published SOC, as a fraction of the std of ln R. Without measurements of the cell, the point of the OCV curve
-at which it is full is uncertain."""
+"""Minimum std of the published SOC, as a fraction of the std of ln R. Without measurements of the cell, the point of the OCV
+curve at which it is full is uncertain."""
 MIN_RESISTANCE = 1e-4
 """Minimum of each resistance, as a fraction of the sum at SOC 0.5. Equivalent time constants are weighted by resistance
 and need weights above 0."""
@@ -138,7 +138,7 @@ def max_ohm(p: np.void) -> float:
 
 def unmeasured_s(sampling: Sampling) -> float:
     """Return the longest step over which the current counts as measured [s]."""
-    return max(UNMEASURED_S, PERIODS * sampling.period_s)
+    return max(UNMEASURED_S, MAX_STEP_PERIODS * sampling.period_s)
 
 
 def _open_circuit(p: np.void, cell: CellModel, hysteresis_v: float | None) -> None:

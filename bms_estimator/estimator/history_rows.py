@@ -18,7 +18,7 @@ MAX_VOLTAGE_V, MAX_CURRENT_A, MAX_TEMPERATURE_C = 1e5, 1e6, 1e3
 _FILTER_SOC = (-0.1, 1.1)
 """Plausible range of an SOC of the filter, which limits it to -0.05..1.05."""
 ROUNDING_S = 1.0
-"""Maximum decrease of the time between two rows by the rounding of merged rows [s]."""
+"""Maximum decrease of the time between two rows due to the rounding of merged rows [s]."""
 TIME, SEGMENT, CHARGE = (0.0, MAX_TIME_S), (0.0, MAX_SEGMENT), (-MAX_CHARGE_AS, MAX_CHARGE_AS)
 """Plausible ranges of times, numbers of segments and charges."""
 _CURRENT, _VARIANCE = (-MAX_CURRENT_A, MAX_CURRENT_A), (0.0, MAX_CURRENT_A**2)
@@ -45,7 +45,7 @@ _ROW_RANGES = {
 
 
 def checked_rows(rows: NDArray[Any] | None) -> NDArray[np.void]:
-    """Return saved rows.
+    """Return saved rows after a check.
 
     Raises:
         ValueError: They have another layout, an implausible value, or are not in the order of time.

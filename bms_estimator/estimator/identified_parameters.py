@@ -149,27 +149,27 @@ def ocv_correction_with_std(
     """
     f, p = record["filter"], settings["filter"]
     mean, covariance = f["mean"][f["best"]], f["covariance"][f["best"]][NODE:, NODE:]
-    rows, varying_error_v = _node_weights(p.tobytes(), soc.tobytes())
-    variance_v2 = ((rows @ covariance) * rows).sum(axis=1) + varying_error_v**2
-    return rows @ mean[NODE:], np.sqrt(variance_v2)
+    weights_v, varying_error_v = _node_weights(p.tobytes(), soc.tobytes())
+    variance_v2 = ((weights_v @ covariance) * weights_v).sum(axis=1) + varying_error_v**2
+    return weights_v @ mean[NODE:], np.sqrt(variance_v2)
 
 
 @lru_cache(maxsize=64)
 def _node_weights(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the weight of each node of the correction at each SOC [V], and the std of the cell file's curve there [V].
+    """Return the weight of each node of the correction, and the std of the varying error of the curve, at each SOC [V].
 
     Args:
         settings: Bytes of a record of EKF_SETTINGS, a hashable argument for the cache.
         socs: Bytes of an array of SOCs, float64.
     """
     p, soc = np.frombuffer(bytearray(settings), EKF_SETTINGS)[0], np.frombuffer(socs)
-    rows, varying_error_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
+    weights_v, varying_error_v = np.zeros((soc.size, NODES)), np.zeros(soc.size)
     for n, x in enumerate(soc):
         i, t = node_position(x)
-        volts = node_error_scale(p, x, t)
-        rows[n, i], rows[n, i + 1] = volts * (1.0 - t), volts * t
+        scale_v = node_error_scale(p, x, t)
+        weights_v[n, i], weights_v[n, i + 1] = scale_v * (1.0 - t), scale_v * t
         varying_error_v[n] = on_grid(x, p["varying_error_v"])
-    return rows, varying_error_v
+    return weights_v, varying_error_v
 
 
 def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellModel:
@@ -183,8 +183,8 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
     record, settings = estimator.record[0], estimator.settings_record[0]
     capacity = relative_capacity(record)
     ln_r0, ln_r, r_std = _resistance_scales(estimator)
-    middle = fitted_resistance_factors(estimator, np.array([0.5]))[0]
-    r0_factor, pair_factor = math.exp(ln_r0) * middle[0], math.exp(ln_r) * float(np.median(middle[1:]))
+    fitted = fitted_resistance_factors(estimator, np.array([0.5]))[0]
+    r0_factor, pair_factor = math.exp(ln_r0) * fitted[0], math.exp(ln_r) * float(np.median(fitted[1:]))
     values = cell.model_dump()
     values["cell"]["capacity_ah"] *= capacity.value
     values["cell"]["capacity_std"] = min(capacity.relative_std, MAX_CAPACITY_STD)

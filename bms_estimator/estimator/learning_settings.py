@@ -67,7 +67,7 @@ def learning_settings(cell: CellModel, observer: ObserverSettings, observer_reco
 
 
 def _bounds(cell: CellModel, scaled: tuple[int, ...]) -> tuple[float, float]:
-    """Return the bounds of an element of theta by the bounds of its ``scaled`` parameters. 0, the file's value, is included."""
+    """Return the bounds of an element of theta from those of its ``scaled`` parameters. 0, the file's value, is included."""
     bounds = [(cell.bounds(i), cell.a[i]) for i in scaled]
     lower = max(math.log(b.lower / value) for b, value in bounds)
     upper = min(math.log(b.upper / value) for b, value in bounds)

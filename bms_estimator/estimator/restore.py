@@ -1,4 +1,4 @@
-"""Restore of an estimator from a checkpoint's fields."""
+"""Restoration of an estimator from the fields of a checkpoint."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import OBSERVER_COUNTERS, Estimator
 from bms_estimator.estimator.history_rows import MAX_SEGMENT, checked_rows
-from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, HISTORY_ROW
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW, MAX_ROWS
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENTS
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
 from bms_estimator.kernels.kalman_filter.mixture import decorrelate_state
@@ -31,7 +31,7 @@ off for some time, so that its state is outdated."""
 def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
     """Restore a new estimator from a checkpoint's state, with counters that start from zero.
 
-    Fields that the checkpoint lacks, or has in another shape, get their values from a first sample. Additional fields of the
+    Fields that the checkpoint lacks, or has in another shape, are initialized as by a first sample. Additional fields of the
     checkpoint are ignored.
 
     Args:
@@ -87,7 +87,7 @@ def copy_known_fields(record: NDArray[np.void], saved: Mapping[str, NDArray[Any]
 
 
 def _reset_switched_states(estimator: Estimator) -> None:
-    """Initialize current offset and capacity as configured if a changed setting made one a state or a constant."""
+    """Reset current offset or capacity to its prior if a changed setting has enabled or disabled its estimation."""
     f, p = estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
     best = f["best"]
     for j, variance in ((OFFSET, offset_variance(p)), (LN_Q, p["capacity_std"] ** 2)):
@@ -138,7 +138,7 @@ def _invalid_counter_reason(record: NDArray[np.void]) -> str:
     h = record[0]["history"]
     integers = np.concatenate([field.ravel() for _, field in fields(record) if field.dtype.kind == "i"])
     is_plausible = (np.abs(integers.astype(float)) <= MAX_COUNT).all()
-    if not (is_plausible and 0 <= record[0]["next_element"] < ELEMENTS and 0 <= h["count"] <= COMPLETED_ROWS):
+    if not (is_plausible and 0 <= record[0]["next_element"] < ELEMENTS and 0 <= h["count"] <= MAX_ROWS):
         return "a counter or an index is implausible"
     return "" if _has_valid_history(h) else "the last rows of the history are damaged"
 
@@ -163,4 +163,4 @@ def _invalid_filter_reason(f: np.void) -> str:
     if not 0 <= best < count <= HYPOTHESES:
         return f"{count} hypotheses, the best of them {best}"
     variances = np.diagonal(f["covariance"][:count], axis1=1, axis2=2)
-    return "" if (variances >= 0.0).all() else "a variance is not positive"
+    return "" if (variances >= 0.0).all() else "a variance is negative"

@@ -33,8 +33,8 @@ SMALL_CELL_AH = 5.5
 MAX_SINGLE_ROW = 8
 """Number of cells in series above which cells of up to ``SMALL_CELL_AH`` are rarely used without cells in parallel."""
 MAX_LOAD_CUTOFF_SOC = 0.5
-"""SOC of the OCV curve at the cut-off voltage of the load above which the voltage is implausible. Inverters of LFP packs switch
-off at up to 3.2 V per cell, at which the OCV curve of the generic cell has 0.11."""
+"""Maximum plausible SOC of the OCV curve at the cut-off voltage of the load. Inverters of LFP packs switch off at up to 3.2 V per
+cell, at which the OCV curve of the generic cell has 0.11."""
 CONVERTER_STEPS = 1024
 """Number of steps of the firmware's voltage converter."""
 

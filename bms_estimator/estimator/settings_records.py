@@ -12,7 +12,7 @@ from bms_estimator.estimator.anchor_settings import anchor_settings
 from bms_estimator.estimator.filter_settings import filter_settings, max_ohm, unmeasured_s
 from bms_estimator.estimator.learning_settings import LEAK_S, RATE_HZ, REACH, learning_settings
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, PARAMETERS, emf, r_s, r_tl, r_ts
-from bms_estimator.kernels.cell_model.current_interpolation import PERIODS
+from bms_estimator.kernels.cell_model.current_interpolation import MAX_STEP_PERIODS
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
 from bms_estimator.kernels.observer.learning_model import Model
 from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
@@ -41,8 +41,8 @@ MAX_FACTORS = {
     "limiting_current_a": 2.0,
     "internal_current_a": 4.0,
 }
-"""Maximum ratio of each parameter to its value in the file. The minimum ratio is the inverse. A ratio of 1.3 of the
-activation loss at 1 A corresponds to about 8 of the exchange current."""
+"""Maximum ratio of each parameter to its value in the file. The minimum ratio is the inverse. A factor of 1.3 on the
+activation loss at 1 A corresponds to a factor of about 8 on the exchange current."""
 
 
 def fuel_cell_settings(cell: FuelCellModel, observer_record: np.void) -> NDArray[np.void]:
@@ -80,13 +80,13 @@ MIN_LOCK_STEPS = 10.0
 CONVERGED_ERROR = 2.0
 """Default error below which the observer counts as converged, in multiples of the larger of dead zone and converter step."""
 GAP_S = 5.0
-"""Duration of a step above which it counts as a gap [s]; for a slow source, ``PERIODS`` of its periods."""
+"""Duration of a step above which it counts as a gap [s]; for a slow source, ``MAX_STEP_PERIODS`` of its periods."""
 CHECKED_C = 0.5
-"""Change of the current up to which the voltage need not follow, as a C-rate. The charge of a wrong sample is small."""
+"""Maximum change of the current that is not checked by the voltage, as a C-rate. The charge of a wrong sample is small."""
 VISIBLE_DROP_V = 0.01
-"""Ohmic drop of one cell up to which the voltage need not follow [V]."""
+"""Maximum ohmic drop of one cell that is not checked by the voltage [V]."""
 VISIBLE_STEPS = 3.0
-"""Ohmic drop up to which the voltage need not follow, in steps of the voltage converter."""
+"""Maximum ohmic drop that is not checked by the voltage, in steps of the voltage converter."""
 IMPROVED_INDICES = range(1, 13)
 """Indices of the a_i that the improved method adapts (Algorithm 1 of the thesis). a13..a15 follow from (4.2)."""
 
@@ -121,7 +121,7 @@ def estimator_settings(
         identifier: Section ``[identifier]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
         voltage_noise_v: Standard deviation of a voltage sample [V]; None: half of ``voltage_resolution_v``.
-        initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
+        initial_soc: SOC 0..1 at the first sample; None: from the voltage of the first sample by the OCV.
         sampling: Resolution, period and gain errors of the source.
         limits: Limits of charger and protection.
 
@@ -161,7 +161,7 @@ def observer_settings(
         cell: The pack as one two-terminal object.
         observer: Section ``[observer]``.
         voltage_resolution_v: One step of the voltage converter, at the pack's terminals [V].
-        initial_soc: SOC 0..1 at the first sample; None: by the voltage of the first sample and the OCV.
+        initial_soc: SOC 0..1 at the first sample; None: from the voltage of the first sample by the OCV.
 
     Returns:
         Shape (1,), dtype ``OBSERVER_SETTINGS``.
@@ -217,7 +217,7 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
 
 def _period_limits(p: np.void, sampling: Sampling) -> None:
     """Write the limits of a regular sample period to ``p``, a record of dtype ``OBSERVER_SETTINGS``."""
-    p["gap_s"] = max(GAP_S, PERIODS * sampling.period_s)
+    p["gap_s"] = max(GAP_S, MAX_STEP_PERIODS * sampling.period_s)
     p["unmeasured_s"] = unmeasured_s(sampling)
 
 

@@ -22,10 +22,10 @@ DURATIONS_S = 10.0, 60.0
 
 
 UNSEEN_DISCHARGE_C = 1.0
-"""Discharge current that a pack without a configured limit is assumed to supply although it has not been seen to, as a C-rate [1/h].
-Nearly all cells are rated for it."""
+"""Discharge current that a pack without a configured limit is assumed to supply, even if none was observed yet, as a C-rate
+[1/h]. Nearly all cells are rated for it."""
 UNSEEN_CHARGE_C = 0.5
-"""Charge current that a pack without a configured limit is assumed to accept although it has not been seen to, as a C-rate [1/h].
+"""Charge current that a pack without a configured limit is assumed to accept, even if none was observed yet, as a C-rate [1/h].
 Nearly all cells are rated for it."""
 MIN_QUANTILE_RATIO = 0.5
 """Minimum ratio of the 5 % quantile of the power to its median. Below it the power is unknown if the SOC is the cause."""
@@ -39,8 +39,8 @@ class PowerLimits:
         discharge_a: Largest discharge current [A], above 0.
         charge_a: Largest charge current [A], above 0.
         charge_min_c: Temperature below which the pack must not be charged [C].
-        unseen_discharge_a: Largest discharge current [A] unless the pack has been seen to supply a larger one.
-        unseen_charge_a: Largest charge current [A] unless the pack has been seen to accept a larger one.
+        unseen_discharge_a: Limit of the discharge current until a larger one is observed [A].
+        unseen_charge_a: Limit of the charge current until a larger one is observed [A].
     """
 
     discharge_a: float
@@ -50,7 +50,7 @@ class PowerLimits:
     unseen_charge_a: float = np.inf
 
     def with_seen(self, discharge_a: float, charge_a: float) -> Self:
-        """Return the limits of a pack that has been seen with these currents.
+        """Return the limits after these currents were observed.
 
         Args:
             discharge_a: Largest discharge current so far [A], at least 0.
@@ -107,7 +107,7 @@ def power_limits(settings: Settings, cell: CellModel) -> PowerLimits:
 def known_power_w(states: list[Records], settings: Record, duration_s: float, limit_v: float, max_a: float) -> float:
     """Return the 5 % quantile of the available power [W]; NaN if it is unknown because of the SOC.
 
-    It is unknown if the quantile is below half the median, but would not be if the SOC was known.
+    It is unknown if the quantile is below half the median, and would be above half of it with a known SOC.
 
     Args:
         states: States of the filter, each of shape (1,), dtype EKF_STATE. The one with the least power counts.
@@ -167,8 +167,9 @@ class PresentPower:
 def raise_to_present(values: ForecastRows, present: PresentPower, limits: PowerLimits, cutoff_v: float) -> None:
     """Raise the available power to the power that the pack supplies or accepts now.
 
-    A current above its limit counts as the limit. At the cut-off voltage nothing is raised, because the pack cannot continue to
-    supply the present power. At the full voltage it is, because the charger holds this voltage. NaN stays NaN.
+    A current above its limit counts as the limit. At the cut-off voltage the discharge power is not raised, because the pack
+    cannot continue to supply it. At the full voltage the charge power is raised, because the charger holds this voltage. NaN
+    remains NaN.
 
     Args:
         values: Shape (1,), dtype ``FORECAST``; written.

@@ -1,8 +1,8 @@
 """Present capability of a pack: available power, usable capacity, remaining energy, and time to full.
 
 These values need no forecast of the load, and therefore exist at rest and during a charge, too. In a pack with cell voltages,
-single cells limit them. Each cell has a share of a limit of the pack's voltage: the limit divided by the number of cells in series. A pack whose cells all
-equal one cell reaches the limit when this cell reaches its share.
+single cells limit them. The limit of a cell's voltage is that of the pack divided by the number of cells in series. A pack whose
+cells all equal one cell reaches its limit when this cell does.
 """
 
 import math
@@ -70,7 +70,7 @@ def write_capability(
 ) -> None:
     """Write available power, usable capacity, remaining energy and time to full to ``values``.
 
-    With ``cells``, the cell that first reaches its share of the voltage limit determines power and capacity.
+    With ``cells``, the cell that first reaches its voltage limit determines power and capacity.
 
     The values stay unchanged before the first sample, without the identifier and for a fuel cell.
 

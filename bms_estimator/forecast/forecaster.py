@@ -43,7 +43,7 @@ _SEED_COUNT = 2**64
 
 
 class Forecaster:
-    """Makes forecasts from the state of an estimator and the load that it observed.
+    """Forecasts from the state of an estimator and the observed load.
 
     The times of the forecasts and their random numbers depend on the samples alone.
 
@@ -94,7 +94,7 @@ class Forecaster:
         self.deviations = deviations
 
     def update(self, time_s: float) -> None:
-        """Make the forecast that is due at a sample, as ``latest``.
+        """Make the forecast that is due at a sample, and store it in ``latest``.
 
         Args:
             time_s: Time of the sample [s].
@@ -131,7 +131,7 @@ class Forecaster:
             load: Expected load; None: a load like the observed one.
         """
         values, time_s = unknown_values(), float(self.estimator.state["time_s"][0])
-        # a current that the pack has already delivered or accepted is allowed, even if the settings do not give it
+        # a current that the pack has already supplied or accepted is allowed, unless a configured limit is lower
         limits = self._limits.with_seen(*self.load.seen_a)
         write_capability(values, self.estimator, self.cutoff_v, limits, self._largest_a, self.deviations)
         reason = self._reason_without_state()

@@ -1,8 +1,8 @@
 """Observed load: second by second since the last long charge, minute by minute of past discharges, and both as saved arrays.
 
-The mean current of a load varies from trip to trip. How far the future mean may differ from the observed one depends on the number
-and the differences of the batches that were observed: a long homogeneous load has a narrow distribution, and two different trips
-have a wide one. This is the method of batch means. Past discharges are searched for analogues: loads like the present one.
+The mean current of a load varies from trip to trip. The method of batch means estimates how far the future mean may differ from
+the observed one: a long homogeneous load has a narrow distribution, and two different trips have a wide one. Past discharges are
+searched for analogues: loads like the present one.
 """
 
 import math
@@ -24,7 +24,7 @@ from bms_estimator.model.unmeasured_time import UNMEASURED_S
 BATCHES_S = 60, 300, 1200
 """Lengths of the batches whose mean currents are compared [s]. The last one is the scale of a trip."""
 PRIOR_DEGREES = 2
-"""Degrees of freedom with which the variation of shorter batches counts as the prior for that of longer ones."""
+"""Degrees of freedom of the prior for longer batches, which is the variation of shorter ones."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class LoadSpread:
 def load_spread(current_a: Floats) -> LoadSpread:
     """Return the spread of the mean load: the standard error of the observed mean, divided by this mean.
 
-    The variance of the mean over t seconds is c / t. The coefficient c is the length of a batch times the variance of the means of
-    batches, provided that the batches are independent. Each length of batches contributes with its degrees of freedom.
+    The variance of the mean over t seconds is c / t. For independent batches, the coefficient c is the length of a batch times
+    the variance of the batch means. Each length of batches contributes with its degrees of freedom.
 
     Args:
         current_a: Current of each second [A], with a mean above 0.
@@ -58,7 +58,7 @@ def load_spread(current_a: Floats) -> LoadSpread:
 
 
 def _coefficient(current_a: Floats, batch_s: int) -> tuple[float, int]:
-    """Return batch length times variance of the batch means [A^2 s], and its degrees of freedom. Both are 0 with one batch."""
+    """Return batch length times variance of the batch means [A^2 s], and its degrees of freedom; both 0 for one batch."""
     batches = current_a.size // batch_s
     if batches < 2:
         return 0.0, 0
@@ -175,11 +175,13 @@ class PastMinutes:
         Args:
             present_minutes: Number of the last minutes that belong to the present discharge.
         """
-        earlier = self.mean_a.size - present_minutes
-        if present_minutes < COMPARED_MINUTES or earlier < COMPARED_MINUTES + MIN_AHEAD_MINUTES:
+        earlier_minutes = self.mean_a.size - present_minutes
+        if present_minutes < COMPARED_MINUTES or earlier_minutes < COMPARED_MINUTES + MIN_AHEAD_MINUTES:
             return []
         present = self.mean_a[-COMPARED_MINUTES:]
-        windows = np.lib.stride_tricks.sliding_window_view(self.mean_a[: earlier - MIN_AHEAD_MINUTES], COMPARED_MINUTES)
+        windows = np.lib.stride_tricks.sliding_window_view(
+            self.mean_a[: earlier_minutes - MIN_AHEAD_MINUTES], COMPARED_MINUTES
+        )
         difference = np.abs(windows - present).mean(axis=1) / max(float(np.abs(present).mean()), 1e-9)
         ends = list[int]()
         while len(ends) < MAX_ANALOGUES and difference.min() <= MAX_DIFFERENCE:
@@ -223,7 +225,7 @@ def load_arrays(load: LoadHistory, past: PastMinutes) -> dict[str, NDArray[Any]]
 def restore_load(load: LoadHistory, past: PastMinutes, arrays: Mapping[str, NDArray[Any]]) -> None:
     """Restore a load.
 
-    Arrays without the largest currents so far, as the version before saved them, leave them 0.
+    Arrays that an earlier version saved lack the largest currents, which are then 0.
 
     Args:
         load: Empty load to fill; unchanged if the arrays are invalid.

@@ -59,7 +59,7 @@ CURVE_DRAWS = 200
 """Number of draws from which the curves are computed."""
 CURVE_POINTS = 60
 """Maximum number of points of a curve."""
-DRAWN_LOADS = 3
+DRAWN_LOADS_WEIGHT = 3
 """Weight of randomly drawn loads, if the weight of each analogue is 1. The draws are divided in proportion to the weights."""
 MIN_OBSERVED_BLOCK_S = 10
 """Minimum length of a block of the observed load [s]."""
@@ -158,7 +158,7 @@ def _analogue_parts(
     """Yield the indices of the draws that follow each analogue, and its parts, corrected for the offset of the sensor."""
     for number, load in enumerate(analogues):
         true_load = replace(load, current_a=load.current_a - pack["offset_a"][0])
-        yield np.arange(number, DRAWS, len(analogues) + DRAWN_LOADS), _parts(true_load, horizon_s)
+        yield np.arange(number, DRAWS, len(analogues) + DRAWN_LOADS_WEIGHT), _parts(true_load, horizon_s)
 
 
 def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:

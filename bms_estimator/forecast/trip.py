@@ -19,7 +19,7 @@ MAX_TRIP_S = 7.0 * 86_400.0
 MAX_POINTS = 1_000_000
 """Maximum number of points of a profile."""
 CONSTANT_PART_S = 3600.0
-"""Duration of the single part of a constant load without an end [s]. The part repeats, so that any duration gives the same load."""
+"""Duration of the single part of a constant load without an end [s]. The part repeats, so that any duration is equivalent."""
 
 
 @dataclass(frozen=True)

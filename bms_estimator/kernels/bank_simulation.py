@@ -97,7 +97,7 @@ def cell_voltage(p: Record, s: Record, current_a: float, ohm_factor: float, cels
         current_a: Current [A], positive on discharge.
         ohm_factor: Factor on the resistances.
         celsius: Temperature of the cell [degC].
-        ohm: Resistances by the cell file [ohm], shape (RESISTANCES,); written.
+        ohm: Resistances of the cell file [ohm], shape (RESISTANCES,); written.
     """
     resistances(
         s.soc,

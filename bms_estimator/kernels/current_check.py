@@ -1,10 +1,9 @@
-"""Check of a current that the voltage does not follow, such as an overflow or a damaged value.
+"""Check of the current by the voltage, against overflows and damaged values.
 
 A change of the current changes the voltage by at least a part of the ohmic drop. Without that change the sample is doubtful
 and waits. The next samples confirm it if the current stays near its level, or if the voltage follows late, because the
 device measured it before the current. Otherwise it is rejected. A current just below 65,536 steps of a protocol is rejected
-without waiting, because a small charge becomes this value if a signed number of 16 bits is read as an unsigned one, and
-may stay there.
+without waiting. It may be a small charge current, a signed number of 16 bits that was read as an unsigned one, and may last.
 
 ``d`` is a record of CURRENT_CHECK, ``s`` of ESTIMATOR_STATE, ``p`` of OBSERVER_SETTINGS.
 """
@@ -17,21 +16,21 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.model.sample import SampleStatus
 from bms_estimator.numba_cache import njit
 
-FOLLOWED = 0.2
-"""Minimum change of the voltage as a fraction of the ohmic drop by R_s of the cell file. R_s of a power cell may be a third of
-the generic one."""
+FOLLOWED_FRACTION = 0.2
+"""Minimum change of the voltage as a fraction of the ohmic drop across R_s of the cell file. R_s of a power cell may be a third
+of the generic one."""
 MAX_WAITING = 2
 """Maximum number of doubtful samples near one level that wait. The next one confirms them, even if the voltage still does not
 follow, because a level that persists is a load."""
-SLOW_S = 60.0
+RC_HIDING_S = 60.0
 """Step from which the RC pairs may hide a change of the current completely [s]. In a shorter step they hide a part."""
-NEAR = 0.5
+NEAR_FRACTION = 0.5
 """Maximum difference of a current that confirms a doubtful one, as a fraction of the doubtful change."""
-WRAP = 65536.0
+UINT16_VALUES = 65536.0
 """Number of values of an integer of 16 bits."""
 STEPS_A = (1.0, 0.1, 0.01, 0.001)
 """Usual resolutions of a current in protocols [A]."""
-MAX_WRAPPED = 0.05
+MAX_WRAPPED_FRACTION = 0.05
 """Maximum charge current that counts as small, as a fraction of the range of the integer."""
 _HELD = int(SampleStatus.VOLTAGE_HELD | SampleStatus.CURRENT_HELD)
 
@@ -104,14 +103,14 @@ def voltage_follows(d: Record, p: Record, dt_s: float, current_a: float, voltage
     The RC pairs still follow the reference current, and may hide a change of the opposite direction.
     """
     drop_v = p.check_ohm * abs(current_a - d.reference_a)
-    hidden_v = p.check_slow_ohm * abs(d.reference_a) * min(1.0, dt_s / SLOW_S)
-    return drop_v <= p.check_v + hidden_v or abs(voltage_v - d.reference_v) >= FOLLOWED * drop_v
+    hidden_v = p.check_slow_ohm * abs(d.reference_a) * min(1.0, dt_s / RC_HIDING_S)
+    return drop_v <= p.check_v + hidden_v or abs(voltage_v - d.reference_v) >= FOLLOWED_FRACTION * drop_v
 
 
 @njit(cache=True)
 def is_near(d: Record, current_a: float) -> bool:
     """Return True if a current is near the doubtful level."""
-    return abs(current_a - d.current_a) <= NEAR * abs(d.current_a - d.reference_a)
+    return abs(current_a - d.current_a) <= NEAR_FRACTION * abs(d.current_a - d.reference_a)
 
 
 @njit(cache=True)
@@ -119,7 +118,7 @@ def is_wrapped(current_a: float) -> bool:
     """Return True if a current may be a small negative number of 16 bits that was read as an unsigned one."""
     wrapped = False
     for step_a in STEPS_A:
-        wrapped |= 0.0 <= WRAP * step_a - abs(current_a) <= MAX_WRAPPED * WRAP * step_a
+        wrapped |= 0.0 <= UINT16_VALUES * step_a - abs(current_a) <= MAX_WRAPPED_FRACTION * UINT16_VALUES * step_a
     return wrapped
 
 
@@ -139,7 +138,7 @@ def reject_waiting(s: Record) -> None:
 
 @njit(cache=True)
 def accept_waiting(s: Record, p: Record, dt_s: float, current_a: float, voltage_v: float) -> bool:
-    """Decide about the samples that wait, by an accepted sample. Return True if it confirms them.
+    """Accept or reject the samples that wait, when a later sample is accepted. Return True if it confirms them.
 
     The parameters are those of ``is_doubtful``.
     """

@@ -228,9 +228,10 @@ def add_element_to_map(s: Record, row: int, j: int, identified: bool, dt_s: floa
 def set_adaptation_targets(s: Record, p: Record, e: int) -> None:
     """Set the fitted parameters of an element, within the configured bounds, as limits of (3.18).
 
-    ``e`` is the row of the map. The limit is set directly and not by new bounds, because (3.18) depends on its bounds only through
-    the limit to which a parameter converges (Lemma 4.1.3 of the thesis). Parameters that no law adapts, a13..a15 of R_s with
-    ``law = "improved"``, get the fitted values at once. A capacitance that is negative at the present SOC is not set, because it would end the adaptation (erratum 14).
+    ``e`` is the row of the map. (3.18) depends on its bounds only through the limit to which a parameter converges (Lemma 4.1.3
+    of the thesis), so that the limit is set and not the bounds. Parameters that no law adapts, a13..a15 of R_s with
+    ``law = "improved"``, get the fitted values at once. A capacitance that is negative at the present SOC is not set, because it
+    would end the adaptation (erratum 14).
     """
     if p.sets_targets == 0 or s.fit.bins[e] < MIN_BINS:
         return

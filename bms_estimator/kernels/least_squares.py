@@ -33,8 +33,8 @@ def eliminate_sparse(a: Floats, count: int) -> None:
     """Compute the first columns of the lower Cholesky factor of a matrix in place, for columns with few non-zero elements.
 
     Args:
-        a: Symmetric matrix, of which only the lower triangle is read. Written: the first ``count`` columns of its factor, and
-            the lower triangle of the rest from which the factor's other columns follow.
+        a: Symmetric matrix, of which only the lower triangle is read. The first ``count`` columns of its factor and the lower
+            triangle of the remaining Schur complement are written.
         count: Number of columns.
     """
     for i in range(count):

@@ -27,9 +27,9 @@ MODEL_ROW = np.dtype(
         ("strong", "f8"),  # Arrhenius factor of the part with the high activation energy
         ("hysteresis_factor", "f8"),  # Arrhenius factor of the hysteresis
         ("current_a", "f8", RESISTANCES),  # current through each resistance [A]
-        ("start_load_a", "f8", RESISTANCES),  # what is left of a load of 1 std before the segment [A]
+        ("start_load_a", "f8", RESISTANCES),  # remainder of a load of 1 std before the segment [A]
         ("hysteresis", "f8", 2),  # fast and slow part, counted from 0 at the start of the segment
-        ("start_h_decay", "f8", 2),  # fraction that is left of both parts' values at the start of the segment
+        ("start_h_decay", "f8", 2),  # remaining fraction of both parts' values at the start of the segment
         ("aging_trend", "f8"),  # ln of the factor on the resistances for an aging of 1 std
         ("direction_v", "f8"),  # std of the error by direction [V]
     ],
@@ -37,19 +37,19 @@ MODEL_ROW = np.dtype(
 )
 """Quantities of a history row that do not depend on the unknowns."""
 COLUMNS = 20
-"""Number of unknowns on which the voltage of one row depends."""
+"""Number of unknowns on which the voltage of one row depends: 2, 1, 1, 1, 1, 3, 1, 2, 2, 1, 1, 2 and 2 of the kinds below."""
 
 
 START_H, START_LOAD, SOC, OFFSET, LN_Q, LN_R, AGING, SHAPE, HYSTERESIS, ENTROPY, ARRHENIUS, CURVE, DIRECTION = range(13)
 """Kinds of unknowns in the order of their columns. ``first`` is an array of their first columns in the vector of unknowns."""
 FILE_HYSTERESIS, FILE_ENTROPY = 2 * RESISTANCES, 2 * RESISTANCES + 1
-"""Columns of the table of a cell file. The first are the parts of each resistance with the low, then with the high activation
-energy. Its rows are evenly spaced SOCs 0..1."""
+"""Columns in the table of a cell file, after the parts of each resistance with the low and with the high activation energy.
+The rows of the table are evenly spaced SOCs 0..1."""
 
 
 @njit(cache=True)
 def node_below(soc: float, nodes: int) -> tuple[int, float]:
-    """Return the evenly spaced node below an SOC, and the distance from it as a fraction of that to the next node.
+    """Return the evenly spaced node below an SOC, and the fraction of the distance to the next one.
 
     An SOC beyond 0..1 gets the position of the nearest end.
     """
@@ -61,8 +61,8 @@ def node_below(soc: float, nodes: int) -> tuple[int, float]:
 @njit(cache=True)
 def interpolate(values: Floats, start: int, nodes: int, soc: float) -> float:
     """Return the piecewise linear function whose values at evenly spaced SOCs begin at ``values[start]``."""
-    below, high = node_below(soc, nodes)
-    return (1.0 - high) * values[start + below] + high * values[start + below + 1]
+    below, fraction = node_below(soc, nodes)
+    return (1.0 - fraction) * values[start + below] + fraction * values[start + below + 1]
 
 
 @njit(cache=True)
@@ -76,7 +76,7 @@ def resistances_and_currents(
     ohm, current_a = np.empty((soc.size, RESISTANCES)), np.empty((soc.size, RESISTANCES))
     r = np.exp(x[first[LN_R] : first[LN_R] + 3])
     for j in range(soc.size):
-        row, (below, high) = rows[j], node_below(soc[j], table.shape[0])
+        row, (below, fraction) = rows[j], node_below(soc[j], table.shape[0])
         common = math.exp(
             interpolate(x, first[SHAPE], SHAPE_NODES, soc[j])
             + x[first[ARRHENIUS]] * row.above_25_c_k
@@ -85,8 +85,10 @@ def resistances_and_currents(
         offset_a, load = x[first[OFFSET] + row.interval] * row.one_c_a, x[first[START_LOAD] + row.segment]
         for k in range(RESISTANCES):
             scale, i = common * r[RESISTANCE_GROUPS[k]], RESISTANCES + k
-            weak_ohm = row.weak * ((1.0 - high) * table[below, k] + high * table[below + 1, k])
-            ohm[j, k] = scale * (weak_ohm + row.strong * ((1.0 - high) * table[below, i] + high * table[below + 1, i]))
+            weak_ohm = row.weak * ((1.0 - fraction) * table[below, k] + fraction * table[below + 1, k])
+            ohm[j, k] = scale * (
+                weak_ohm + row.strong * ((1.0 - fraction) * table[below, i] + fraction * table[below + 1, i])
+            )
             current_a[j, k] = row.current_a[k] - offset_a + load * row.start_load_a[k]
     return ohm, current_a
 
@@ -108,13 +110,13 @@ def voltages(
     ohm, current_a = resistances_and_currents(rows, table, x, first, soc)
     voltage_v = ocv_v.copy()
     for j in range(soc.size):
-        row, z, (below, high) = rows[j], soc[j], node_below(soc[j], table.shape[0])
-        entropy = (1.0 - high) * table[below, FILE_ENTROPY] + high * table[below + 1, FILE_ENTROPY]
+        row, z, (below, fraction) = rows[j], soc[j], node_below(soc[j], table.shape[0])
+        entropy = (1.0 - fraction) * table[below, FILE_ENTROPY] + fraction * table[below + 1, FILE_ENTROPY]
         voltage_v[j] += interpolate(x, first[CURVE], CURVE_NODES, z) + row.above_25_c_k * (x[first[ENTROPY]] + entropy)
         voltage_v[j] += row.direction_v * interpolate(
             x, first[DIRECTION] + row.direction * DIRECTION_NODES, DIRECTION_NODES, z
         )
-        hysteresis_v = (1.0 - high) * table[below, FILE_HYSTERESIS] + high * table[below + 1, FILE_HYSTERESIS]
+        hysteresis_v = (1.0 - fraction) * table[below, FILE_HYSTERESIS] + fraction * table[below + 1, FILE_HYSTERESIS]
         for i in range(2):
             state = row.hysteresis[i] + row.start_h_decay[i] * x[first[START_H] + 2 * row.segment + i]
             voltage_v[j] += x[first[HYSTERESIS] + i] * row.hysteresis_factor * hysteresis_v * state
@@ -140,8 +142,8 @@ def voltage_derivatives(
     columns, values = np.empty((soc.size, COLUMNS), np.intp), np.zeros((soc.size, COLUMNS))
     ohm, current_a = resistances_and_currents(rows, table, x, first, soc)
     for j in range(soc.size):
-        row, at, d, (below, high) = rows[j], columns[j], values[j], node_below(soc[j], table.shape[0])
-        file_v = (1.0 - high) * table[below, FILE_HYSTERESIS] + high * table[below + 1, FILE_HYSTERESIS]
+        row, at, d, (below, fraction) = rows[j], columns[j], values[j], node_below(soc[j], table.shape[0])
+        file_v = (1.0 - fraction) * table[below, FILE_HYSTERESIS] + fraction * table[below + 1, FILE_HYSTERESIS]
         for i in range(2):
             at[i], at[12 + i] = first[START_H] + 2 * row.segment + i, first[HYSTERESIS] + i
             d[12 + i] = row.hysteresis_factor * file_v * (row.hysteresis[i] + row.start_h_decay[i] * x[at[i]])
@@ -167,6 +169,6 @@ def voltage_derivatives(
 @njit(cache=True)
 def _write_nodes(at: NDArray[np.intp], d: Floats, i: int, first: int, soc: float, nodes: int, factor: float) -> None:
     """Write columns and derivatives of ``factor`` times an interpolated function to positions ``i`` and ``i`` + 1."""
-    below, high = node_below(soc, nodes)
+    below, fraction = node_below(soc, nodes)
     at[i], at[i + 1] = first + below, first + below + 1
-    d[i], d[i + 1] = factor * (1.0 - high), factor * high
+    d[i], d[i + 1] = factor * (1.0 - fraction), factor * fraction

@@ -1,8 +1,7 @@
 """Lossless packing of records without redundant 8-byte words: zeros, and lower triangles of symmetric matrices.
 
-The packed form is a bitmap with one bit for each word, the lowest first, and the words whose bit is set. A word without a
-bit equals the earlier word that the symmetry map of the layout names, or is 0. A matrix that is not symmetric is stored in
-full.
+The packed form is a bitmap with one bit for each word, the lowest first, and the words whose bit is set. A word whose bit is
+not set equals the earlier word to which the symmetry map refers, or is 0. A matrix that is not symmetric is stored in full.
 """
 
 import math

@@ -61,11 +61,8 @@ ESTIMATOR_STATE = np.dtype(
         ("fit_age_s", "f8"),  # time since the last fit of an element [s]
         ("next_element", "i8"),  # index of the element to be fitted next
         ("unseen_s", "f8"),  # gap before the first sample with a new time base [s]; infinite if unknown
-        (
-            "unlearned_s",
-            "f8",
-            ELEMENTS,
-        ),  # time since the map's last observation of each element [s]; infinite: none yet
+        # time since the map's last observation of each element [s]; infinite: none yet
+        ("unlearned_s", "f8", ELEMENTS),
     ],
     align=True,
 )

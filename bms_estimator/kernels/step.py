@@ -93,8 +93,8 @@ def process_sample(
     A sample with a current that the voltage does not follow waits for the next ones (``current_check``). If they confirm it,
     it is used without its voltage.
 
-    A sample with a held current is stored until the next measured current, because the current at its time is then
-    interpolated. Until then only the last of several such voltages is stored.
+    A sample with a held current is stored until the next measured current, from which the current at its time is interpolated.
+    Of several such samples only the last one is stored.
 
     Args:
         s: Record of ESTIMATOR_STATE; updated in place.
@@ -223,7 +223,7 @@ def step(
     status: int,
     temperature_c: float,
 ) -> int:
-    """Process one sample and return its ``SampleOutcome``: ``process_sample`` for the arrays of ``run``."""
+    """Process one sample and return its ``SampleOutcome``. The arrays are those of ``run``."""
     return process_sample(state[0], settings[0], time_s, current_a, voltage_v, status, temperature_c)
 
 
@@ -298,7 +298,7 @@ def write_filter_trace(row: Record, s: Record, p: Record) -> None:
     Without the filter, ``innovation_v`` and ``voltage_estimate_v`` are the observer's e and y^, ``r_s_ohm`` is R_s by (4.2)
     if enabled, and the other columns are NaN. ``soc_ocv`` is then NaN, because the observer's v_ts and v_tl absorb any error
     of the SOC, so that the inverted OCV (7.1) would return the observer's own SOC. It is also NaN with a held voltage or
-    current, because both do not belong to one time.
+    current, because voltage and current were not measured together.
     """
     if not p.identify:
         row.innovation_v, row.voltage_estimate_v = s.observer.innovation_v, s.observer.voltage_estimate_v

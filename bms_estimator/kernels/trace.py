@@ -12,14 +12,10 @@ TRACE = np.dtype(
         ("current_a", "f8"),  # positive on discharge
         ("temperature_c", "f8"),
         ("soc", "f8"),
-        (
-            "voltage_estimate_v",
-            "f8",
-        ),  # predicted by the identifier for its last update; without the identifier, the observer's y^ [V]
-        (
-            "innovation_v",
-            "f8",
-        ),  # measured minus predicted voltage of the identifier; without the identifier, the observer's e [V]
+        # predicted by the identifier for its last update; without the identifier, the observer's y^ [V]
+        ("voltage_estimate_v", "f8"),
+        # measured minus predicted voltage of the identifier; without the identifier, the observer's e [V]
+        ("innovation_v", "f8"),
         ("tracking_error_v", "f8"),  # the observer's e (3.15)
         ("nussbaum_gain", "f8"),  # N(k) (3.12) of a law of the thesis, or NaN
         ("adaptation_gain_hz", "f8"),  # gamma k of the learning law, or NaN [1/s]
@@ -32,10 +28,8 @@ TRACE = np.dtype(
         ("lock", "i8"),  # 1 while the observer tracks the voltage
         ("converged", "i8"),  # 1: |e| < eps2 of Algorithm 1
         ("soc_coulomb", "f8"),  # by coulomb counting alone
-        (
-            "soc_ocv",
-            "f8",
-        ),  # by the inverted OCV (7.1); this column and all later ones are the identifier's, NaN without it
+        # from the inverted OCV (7.1); this column and all later ones belong to the identifier and are NaN without it
+        ("soc_ocv", "f8"),
         ("soc_std", "f8"),
         ("r_s_ohm", "f8"),
         ("r_s_std_ohm", "f8"),

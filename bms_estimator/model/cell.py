@@ -1,7 +1,7 @@
 """Cell model: contents of a cell file, with a1..a21.
 
-Numbers in parentheses are equations of the thesis, and Lemma 4.1.1 and Lemma 4.1.3 are lemmas of the thesis. a1..a15 are the
-parameters of the circuit elements over SOC, and a16..a21 those of the open-circuit voltage.
+Numbers in parentheses are equations of the thesis, and lemmas are those of the thesis. a1..a15 are the parameters of the circuit
+elements over SOC. a16..a21 are the parameters of the open-circuit voltage.
 
 The values describe ``series_count`` cells in series as one two-terminal object. ``CellModel.pack`` scales them to packs
 of such objects in series and parallel.
@@ -93,8 +93,8 @@ class TableOcv(Strict):
     soc: tuple[Annotated[float, Field(ge=0, le=1)], ...] = Field(min_length=4, description="increasing, from 0 to 1")
     ocv_v: tuple[Positive, ...] = Field(
         min_length=4,
-        description="open-circuit voltage at each SOC, increasing; after discharge, or with hysteresis_v the mean of that after discharge "
-        "and that after charge",
+        description="open-circuit voltage at each SOC, increasing: after discharge, or with hysteresis_v the mean of the "
+        "voltages after discharge and after charge",
     )
     error_v: tuple[Positive, ...] | None = Field(default=None, description="standard deviation of ocv_v")
     hysteresis_v: tuple[NotNegative, ...] | None = Field(
@@ -131,12 +131,14 @@ class Ladder(Strict):
     weak_ohm: tuple[tuple[NotNegative, ...], ...] = Field(
         min_length=7,
         max_length=7,
-        description="part with the low activation energy at 25 C: series resistance, then resistance of each RC pair, one value for each SOC",
+        description="part with the low activation energy at 25 C: series resistance, then resistance of each RC pair, one value "
+        "for each SOC",
     )
     strong_ohm: tuple[tuple[NotNegative, ...], ...] = Field(
         min_length=7,
         max_length=7,
-        description="part with the high activation energy at 25 C: series resistance, then resistance of each RC pair, one value for each SOC",
+        description="part with the high activation energy at 25 C: series resistance, then resistance of each RC pair, one value "
+        "for each SOC",
     )
     std: Positive = Field(
         description="relative standard deviation of a common factor of all resistances between cells of this type"
@@ -192,9 +194,9 @@ class Rated(Strict):
     description: str = ""
     series_count: Annotated[int, Field(ge=1)] = Field(default=1, description="cells in series that the values describe")
     nominal_voltage_v: Positive
-    voltage_min_v: Positive = Field(description="a sample below is a glitch")
-    voltage_max_v: Positive = Field(description="a sample above is a glitch")
-    current_max_a: Positive = Field(description="a sample of larger magnitude is a glitch")
+    voltage_min_v: Positive = Field(description="samples below this voltage are rejected")
+    voltage_max_v: Positive = Field(description="samples above this voltage are rejected")
+    current_max_a: Positive = Field(description="samples with a current of larger magnitude are rejected")
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -445,7 +447,7 @@ def with_capacity(cell: CellModel, capacity_ah: float, relative_std: float | Non
 
 
 def fitted_to(cell: CellModel, captures: Sequence[str], grade: Grade | None = None) -> CellModel:
-    """Return the cell with the digests of the captures that it was fitted to, beside those of the cell it began with.
+    """Return the cell with the digests of the captures that it was fitted to, in addition to those that it has.
 
     Args:
         cell: The cell.

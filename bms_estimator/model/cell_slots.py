@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import CellBlock
 
-MIN_CELL_V, MAX_CELL_V = 0.1, 6.0
+MIN_LIVE_V, MAX_LIVE_V = 0.1, 6.0
 """Range of the absolute voltage of a live cell [V]. Empty slots read 0 V, a few millivolts of noise, or the largest number of
 their format. No single cell exceeds 5 V."""
 MIN_SAMPLES = 10
@@ -20,37 +20,37 @@ class CellSlots:
     """Cell slots of one device.
 
     Many devices report more slots than their pack has cells. Once a sample has as many live slots as cells in series, these
-    slots are the cells, even if a cell fails later. Before that, the live slots and the first of the others are the cells.
-    The division of the samples into blocks does not change the selection.
+    slots are the cells, even if a cell fails later. Before that, the live slots are selected, and as many of the first other
+    slots as are missing. The division of the samples into blocks does not change the selection.
 
     Args:
         series: Number of cells in series.
         slots: Slots of the cells. Another number than ``series`` has no effect.
-        former: Slots of the cells in an earlier run (``known``), if the cells may have other slots now.
+        earlier: Slots of the cells in an earlier run (``cell_indices``), if the cells may have other slots now.
 
     Attributes:
         fault: Fault of the last block if it has more live slots than cells in series, as a sentence; empty otherwise.
         moved: Reason why a cell may be missing, as a sentence, if the last block has shown the cells in other slots than
-            ``former``; empty otherwise.
+            ``earlier``; empty otherwise.
     """
 
-    def __init__(self, series: int, slots: Sequence[int] = (), former: Sequence[int] = ()) -> None:
+    def __init__(self, series: int, slots: Sequence[int] = (), earlier: Sequence[int] = ()) -> None:
         self._series, self._is_known = series, len(slots) == series
         self._slots = np.array(slots) if self._is_known else np.arange(series)
-        self._former = list(former) if len(former) == series else []
+        self._earlier = list(earlier) if len(earlier) == series else []
         self.fault = self.moved = self._excess_text = ""
         self._excess_samples = 0  # number of successive samples with too many live slots
         # until enough cells are live: number of samples with live slots, and the largest number of live slots
         self._samples = self._max_cells = 0
 
     @property
-    def known(self) -> list[int]:
-        """Slots of the cells, counted from 0; those of the earlier run until a sample has as many live slots as cells in series."""
-        return self._slots.tolist() if self._is_known else self._former
+    def cell_indices(self) -> list[int]:
+        """Slots of the cells, counted from 0. They are those of the earlier run until this run has determined them."""
+        return self._slots.tolist() if self._is_known else self._earlier
 
     @property
     def reason(self) -> str:
-        """Reason why single cells have no estimates, as a sentence; empty if they have estimates, and in the first samples."""
+        """Reason why single cells have no estimates, as a sentence; empty if they have estimates, or in the first samples."""
         if self._excess_samples >= MIN_SAMPLES:
             return self._excess_text
         if self._samples < MIN_SAMPLES or self._has_enough:
@@ -103,16 +103,18 @@ class CellSlots:
             self._excess_samples, self._excess_text = self._excess_samples + len(slots_v), self.fault
             return np.full((len(slots_v), self._series), np.nan)
         self._excess_samples = 0
-        if count == self._series and not self._is_known:  # later, a floating slot would replace a failed cell
+        if count == self._series and not self._is_known:  # only once: later a floating slot might replace a failed cell
             self._slots, self._is_known = np.flatnonzero(live), True
-            if self._former and self._former != self.known:
-                slots, former = (", ".join(str(slot + 1) for slot in each) for each in (self.known, self._former))
+            if self._earlier and self._earlier != self.cell_indices:
+                slots, earlier = (
+                    ", ".join(str(slot + 1) for slot in each) for each in (self.cell_indices, self._earlier)
+                )
                 self.moved = (
-                    f"cells are measured in slots {slots}, and were in {former} before the restart: check their wires"
+                    f"cells are measured in slots {slots}, and were in {earlier} before the restart: check their wires"
                 )
         if self._is_known:
             return slots_v[:, self._slots]
-        # the live slots, and the first of the others: one of them is a cell with a broken wire
+        # the live slots, and the first other slots, among which may be cells with a broken wire
         order = np.argsort(~live, kind="stable")[: self._series]
         return slots_v[:, np.sort(order)]
 
@@ -120,4 +122,4 @@ class CellSlots:
 def is_live(slots_v: Floats) -> NDArray[np.bool_]:
     """Return True for each slot that has the voltage of a cell; NaN: False."""
     magnitude_v = np.abs(slots_v)
-    return (magnitude_v >= MIN_CELL_V) & (magnitude_v <= MAX_CELL_V)
+    return (magnitude_v >= MIN_LIVE_V) & (magnitude_v <= MAX_LIVE_V)

@@ -11,8 +11,8 @@ from bms_estimator.model.unmeasured_time import MAX_FLOW_S, UNMEASURED_S
 MIN_GAP_PERIODS = 10.0
 """Minimum duration of a gap in multiples of the median sample period."""
 MIN_GAP_TO_LONG_PERIOD = 1.5
-"""Minimum duration of a gap in multiples of the 99th percentile of the sample period. Many loggers record rests at a longer period,
-which the percentile includes, so that such steps are no gaps."""
+"""Minimum duration of a gap in multiples of the 99th percentile of the sample period. Many loggers record rests at a longer
+period. The percentile includes this period, so that such steps are not gaps."""
 
 
 class TimeFaults:
@@ -127,8 +127,8 @@ def gap_warnings(time_s: Floats, current_a: Floats) -> list[str]:
         return []
     first = int(gaps[0])
     line = (
-        f"the current in gaps of more than an hour is unknown and counts as 0 A: number of gaps beside a load: {gaps.size}; the first "
-        f"begins at {time_s[first]:g} s and lasts {time_s[first + 1] - time_s[first]:.0f} s, with {current_a[first]:g} A before and "
-        f"{current_a[first + 1]:g} A after it"
+        f"the current in gaps of more than an hour is unknown and counts as 0 A: number of gaps beside a load: {gaps.size}; "
+        f"the first begins at {time_s[first]:g} s and lasts {time_s[first + 1] - time_s[first]:.0f} s, with "
+        f"{current_a[first]:g} A before and {current_a[first + 1]:g} A after it"
     )
     return [line]

@@ -13,7 +13,7 @@ def since_boot() -> float:
 
 @dataclass(frozen=True)
 class Clock:
-    """Pair of clocks [s]: ``wall`` for the time of day, which may be set, and ``monotonic`` for durations, including suspended time."""
+    """Pair of clocks [s]. ``wall`` is the time of day, which may be set. ``monotonic`` is for durations, with suspended time."""
 
     wall: Callable[[], float] = time.time
     monotonic: Callable[[], float] = since_boot

@@ -157,7 +157,7 @@ def _key_path(table: object, detail: Any) -> list[str]:
             keys.append(str(key))
             table = table[key] if key < len(table) else None
     missing_key = [_discriminator(detail)] if detail["type"] == "union_tag_not_found" else []
-    # the last part of the location of a whole model's error may be the name of the model
+    # the location of an error in a whole model may end with the name of the model, which is not a key
     is_model = detail["type"] == "value_error" and location and not _can_contain(table, location[-1])
     last_key = [] if is_model else location[-1:]
     return [*keys, *map(str, last_key), *missing_key]
@@ -208,7 +208,7 @@ def _description(model: type[BaseModel], keys: list[str]) -> str:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models within an annotation: itself, or the members of a union."""
+    """Return the models within an annotation: the annotation itself, or the members of a union."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models(part)]

@@ -69,7 +69,7 @@ class FuelCellModel(Strict):
 
     @property
     def a(self) -> NDArray[np.float64]:
-        """Constants of the kernels, shape (16,), the size of a1..a15 of a battery cell with index 0 unused.
+        """Constants of the kernels, shape (16,), as for a1..a15 of a battery cell.
 
         Index 1..7: parameters in the order of ``kernels.cell_model.fuel_cell.NAMES``. Index 8..11: cells in series,
         temperature [C], partial pressures of hydrogen and oxygen [atm]. All other elements are 0 and not used.
@@ -87,7 +87,7 @@ class FuelCellModel(Strict):
     always_learns: ClassVar[bool] = True
     """True: the observer uses the law ``learning``, whatever is configured."""
     min_voltage_ratio: ClassVar[float] = 0.0
-    """Minimum voltage relative to the nominal voltage. A stack without gas has none."""
+    """Minimum voltage relative to the nominal voltage. A stack without gas has 0 V."""
 
     def by_kind(self, _battery: object, stack: Callable[["FuelCellModel"], Result]) -> Result:
         """Return the result of the second function, that of a stack, for this model."""
@@ -121,7 +121,7 @@ class FuelCellModel(Strict):
         return MAX_CURRENT_RATIO * self.cell.current_max_a
 
     def state_basis(self, current_sign: str) -> tuple[float | str, ...]:
-        """Return all numbers on which the meaning of a saved state depends: learned values are relative to all parameters."""
+        """Return all numbers on which the meaning of a saved state depends. Learned values are relative to all parameters."""
         return (*self.a, current_sign)
 
     @property

@@ -46,7 +46,7 @@ ProbeBlock = NDArray[np.void]
 NO_PROBES: ProbeBlock = np.empty((0, 0), dtype=PROBE)
 """Empty ``ProbeBlock``, used for blocks of any length without a list of probes."""
 NO_SOC: NDArray[np.float64] = np.empty(0)
-"""Empty array, used for blocks of any length without an SOC by the device."""
+"""Empty array, used for blocks of any length without an SOC that the device reports."""
 
 MIN_C = -60.0
 """Lowest plausible temperature of a pack or stack [C]."""

@@ -21,7 +21,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     LOW_ACTIVATION_ENERGY,
     REFERENCE_C,
     TAUS,
-    TREND,
+    TREND_PAIR,
 )
 from bms_estimator.kernels.pack_voltage import MODEL_ROW, RESISTANCE_GROUPS, voltage_derivatives, voltages
 from bms_estimator.model.arrays import Floats
@@ -42,7 +42,7 @@ from empty gave an SOC 6 to 8 % wrong, because errors of offset, capacity and kn
 24 h of six real histories had an RMS error of 1.6 % with 0.008, 2.3 % with 0.015, and 1.9 % with 0.005."""
 SURFACE_STD_SOC, SURFACE_WIDTH_SOC = 0.03, 0.25
 """Std of the SOC at the surface of the particles about the model, per C-rate of discharge at 25 C, and SOC over which it decays
-[SOC]. The C-rate is that of the filtered current of the RC pair ``TREND``. The voltage collapses when the surface is empty: at 0 C
+[SOC]. The C-rate is that of the current filtered by ``TREND_PAIR``. The voltage collapses when the surface is empty: at 0 C
 and 1C, a cell of 58 Ah ends its discharge with 20 % of its charge left. Without this std, the fit takes the collapse for the knee of
 the OCV. Diffusion depends on the temperature as the strong part of the resistances does."""
 START_LOAD_C = 0.6
@@ -191,7 +191,7 @@ def by_surface(cell: CellCurves, rows: NDArray[np.void], z: Floats, drop_v: Floa
         drop_v: Overpotentials [V].
         strong: Arrhenius factors of diffusion.
     """
-    discharge_c = np.where(rows["direction"] > 0.0, np.maximum(rows["x_a"][:, TREND], 0.0), 0.0) / cell.one_c_a
+    discharge_c = np.where(rows["direction"] > 0.0, np.maximum(rows["x_a"][:, TREND_PAIR], 0.0), 0.0) / cell.one_c_a
     lowest = np.minimum(z, cell.soc(rows["voltage_v"] / cell.series + drop_v))
     std_soc = SURFACE_STD_SOC * discharge_c * strong * np.exp(-((lowest / SURFACE_WIDTH_SOC) ** 2))
     return np.asarray((cell.slope(lowest) * std_soc) ** 2)

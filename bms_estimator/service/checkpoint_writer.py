@@ -166,7 +166,7 @@ class CheckpointWriter:
     @property
     def _delay_of_counters_s(self) -> float:
         """Minimum interval between two saves of counters and alarms [s]; 0 if the next one is urgent."""
-        if self._saved_counters is None or self._slots.known != self._saved_counters.cell_slots:
+        if self._saved_counters is None or self._slots.cell_indices != self._saved_counters.cell_slots:
             return 0.0
         if self._alarms.saved_state == self._saved_counters.alarms:
             return self._interval_s
@@ -186,7 +186,7 @@ class CheckpointWriter:
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""
         hooks = self._hooks.finished_hashes if clean else None  # after a crash all hooks repeat their jobs
-        alarms, slots = self._alarms.saved_state, self._slots.known
+        alarms, slots = self._alarms.saved_state, self._slots.cell_indices
         counters = RunCounters(self._status.restarts, self._totals.total, clean, alarms, hooks, slots)
         file = self._files.run_file
         if counters == self._saved_counters:

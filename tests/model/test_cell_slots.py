@@ -83,6 +83,6 @@ def test_a_floating_slot_does_not_replace_a_failed_cell() -> None:
     slots, swapped = CellSlots(4), np.array([[LIVE[0], 0.02, *LIVE[2:], 3.2, 0.0]])
     slots.select(np.array([[*LIVE, 0.0, 0.0]]))
     assert slots.select(swapped).tolist() == [[LIVE[0], 0.02, *LIVE[2:]]]
-    assert slots.known == [0, 1, 2, 3]
-    assert CellSlots(4, slots.known).select(swapped).tolist() == [[LIVE[0], 0.02, *LIVE[2:]]]
-    assert CellSlots(3, slots.known).select(np.array([[0.0, *LIVE[:3]]])).tolist() == [LIVE[:3]]
+    assert slots.cell_indices == [0, 1, 2, 3]
+    assert CellSlots(4, slots.cell_indices).select(swapped).tolist() == [[LIVE[0], 0.02, *LIVE[2:]]]
+    assert CellSlots(3, slots.cell_indices).select(np.array([[0.0, *LIVE[:3]]])).tolist() == [LIVE[:3]]

@@ -83,7 +83,7 @@ def test_charge_is_the_mean_over_the_row(samples: SampleBlock, rows: np.ndarray)
 
 
 def test_rows_end_at_changes_of_direction(rows: np.ndarray) -> None:
-    """The direction is that of the current filtered by the RC pair ``TREND``, and therefore changes later."""
+    """The direction is that of the current filtered by the RC pair ``TREND_PAIR``, and therefore changes later."""
     assert rows["direction"][[0, -1]].tolist() == [0.0, 0.0]
     changes_s = ends_s(rows)[:-1][np.diff(rows["direction"]) != 0.0]
     assert np.all(

@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 
 from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
 from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES
-from bms_estimator.kernels.kalman_filter.equivalent_circuit import LN_TAUS, SHORT
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import LN_TAUS, SHORT_PAIRS
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import Capacitance, Ladder, Resistance
 
@@ -23,7 +23,7 @@ MIN_FRACTION = 1e-4
 """Minimum resistance of a section, as a fraction of the sum. A cell file requires values above 0."""
 MAX_DELTA = 0.01
 """Maximum delta1 and delta2. The capacitances are positive down to this SOC."""
-SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT), "r_tl": (1 + SHORT, RESISTANCES)}
+SECTIONS = {"r_s": (0, 1), "r_ts": (1, 1 + SHORT_PAIRS), "r_tl": (1 + SHORT_PAIRS, RESISTANCES)}
 """First index, and index after the last, of the ladder's resistances whose sum each section of the cell file
 contains."""
 

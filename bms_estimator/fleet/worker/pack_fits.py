@@ -19,7 +19,7 @@ from bms_estimator.fleet.fits.messages import COMPARED, FitRequest, FitResult, R
 from bms_estimator.fleet.packs.pack_type import Bytes, PackType, WorkerFit, bytes_of
 from bms_estimator.fleet.worker.block_result import QueuedMessage
 from bms_estimator.fleet.worker.pack_state import PACK_FIT
-from bms_estimator.kernels.accumulators.history import COMPLETED_ROWS, FREE_ROWS
+from bms_estimator.kernels.accumulators.history import MAX_ROWS, MIN_FREE_ROWS
 from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import adopt_curves
@@ -27,9 +27,9 @@ from bms_estimator.pack_model.saved import curve_arrays, fit_of_curves
 from bms_estimator.pack_model.slow_fit import ADOPT_DELAY_S, fit_interval
 
 MAX_CACHED_CURVES = 4096
-"""Maximum number of packs of a partition whose curves are cached, 13 kB each. Other curves are computed for each block."""
-FULL_ROWS = COMPLETED_ROWS - FREE_ROWS
-"""Number of completed rows at which the kernel returns, so that they are sent."""
+"""Maximum number of packs of a partition whose curves are cached [13 kB each]. Other curves are computed with each block."""
+FULL_ROWS = MAX_ROWS - MIN_FREE_ROWS
+"""Number of completed rows at which the kernel returns, so that they are taken."""
 
 
 class PackFits:

@@ -23,12 +23,12 @@ FLOW_SUMS = np.dtype(
 
 @njit(cache=True)
 def accumulate_charge_energy(sums: Records, trace: Records, gap_s: float) -> None:
-    """Add accepted samples by trapezoids, without gaps and steps of a clock that was set back.
+    """Integrate accepted samples by the trapezoidal rule, except over gaps and steps of a clock that was set back.
 
     Args:
         sums: Shape (1,), dtype FLOW_SUMS; updated in place.
         trace: Shape (n,), dtype TRACE.
-        gap_s: Minimum duration of a gap, unless the previous step was about as long [s]; as in ``kernels.step.is_gap``.
+        gap_s: Minimum duration of a gap [s]. A gap is also longer than ``GAP_RATIO`` previous steps.
     """
     s = sums[0]
     for j in range(trace.shape[0]):

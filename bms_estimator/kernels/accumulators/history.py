@@ -1,14 +1,14 @@
-"""Rows of the pack's history: means over times with one direction of the current and a small charge.
+"""Rows of the pack's history: means over periods with one direction of the current and a limited charge.
 
-The slow fit (``bms_estimator.pack_model``) estimates the pack's curve, capacity and resistances from these rows. The voltage
-is linear in the filtered currents of the RC pairs and in the hysteresis, so that its mean depends on their means.
+The slow fit (``bms_estimator.pack_model``) estimates the pack's OCV curve, capacity and resistances from these rows. Means
+suffice, because the voltage is linear in the filtered currents of the RC pairs and in the hysteresis.
 """
 
 import math
 
 import numpy as np
 
-from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TREND
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TREND_PAIR
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
@@ -23,12 +23,12 @@ FIRST_REST_S = 60.0
 REST_GROWTH = 0.5
 """Maximum duration of a later row of a rest, as a fraction of the time since the rest began."""
 DIRECTION_C = 0.015
-"""Minimum current of a discharge or a charge, filtered over 120 s (``x_a[TREND]``), as a C-rate."""
+"""Minimum current of a discharge or a charge, filtered over 120 s (``x_a[TREND_PAIR]``), as a C-rate."""
 HYSTERESIS_SOC = 0.03, 0.15
-"""Charge constants with which the fast and the slow part of the hysteresis approach -1 or 1 [SOC]."""
-COMPLETED_ROWS = 16
+"""Charge constants of the exponential approach of the fast and the slow part of the hysteresis to -1 or 1 [SOC]."""
+MAX_ROWS = 16
 """Number of completed rows that the state can hold."""
-FREE_ROWS = 3
+MIN_FREE_ROWS = 3
 """Number of free rows at which the caller must take the completed ones. One sample may complete three rows: at a change of
 direction, at a known SOC, and at a gap."""
 
@@ -36,13 +36,13 @@ HISTORY_ROW = np.dtype(
     [
         ("elapsed_s", "f8"),  # mean time since the history began [s]
         ("duration_s", "f8"),  # duration of the row [s]; 0: only ``reference_soc`` is valid
-        ("segment", "f8"),  # number of the segment, a time without gaps that may hide a charge
+        ("segment", "f8"),  # number of the segment: a period without gaps in which a charge may have flowed unmeasured
         ("gap_s", "f8"),  # duration of the gap before the segment [s]; infinite if unknown
         ("direction", "f8"),  # 1 discharge, 0 rest, -1 charge
         ("voltage_v", "f8"),
         ("current_a", "f8"),  # positive on discharge
-        ("between_a2", "f8"),  # variance of the true mean current about the measured one, by slow sampling [A^2]
-        ("skew_a2", "f8"),  # variance of ``current_a`` by voltages and currents of different times [A^2]
+        ("between_a2", "f8"),  # variance of ``current_a``: the current between slow samples is unknown [A^2]
+        ("skew_a2", "f8"),  # variance of ``current_a``: voltage and current are not measured at the same time [A^2]
         ("x_a", "f8", BRANCHES),  # current filtered by the RC pairs since their last reset [A]
         ("settled_s", "f8"),  # time from the reset of the RC pairs to the start of the row [s]
         ("temperature_c", "f8"),
@@ -51,7 +51,7 @@ HISTORY_ROW = np.dtype(
         ("throughput_soc", "f8"),  # sum of charge and discharge since the segment began [SOC]
         ("hysteresis", "f8", 2),  # fast and slow part, -1..1; 0 at the start of the segment
         ("soc", "f8"),  # SOC of the filter
-        ("reference_soc", "f8"),  # known SOC, as at the charger's end; NaN: none
+        ("reference_soc", "f8"),  # known SOC, such as at the end of a charge; NaN: none
         ("reference_kind", "f8"),  # 1: end of a charge, 2: end of a discharge, 0: set by the user
         ("reference_std", "f8"),  # std of reference_soc
     ],
@@ -74,7 +74,7 @@ HISTORY = np.dtype(
         ("row_as", "f8"),  # charge since the present row began [A s]
         ("hysteresis", "f8", 2),
         ("sums", HISTORY_ROW),  # sums of the present row, weighted by time
-        ("rows", HISTORY_ROW, COMPLETED_ROWS),  # completed rows
+        ("rows", HISTORY_ROW, MAX_ROWS),  # completed rows
         ("count", "i8"),  # number of completed rows
     ],
     align=True,
@@ -121,7 +121,7 @@ def add_window(h: Record, f: Record, p: Record) -> None:
     if w.gap:  # the mean voltage of a window with a gap belongs to its last samples only
         complete_row(h)
         return
-    direction = direction_of(f.x_a[TREND], p.capacity_as / 3600.0)
+    direction = direction_of(f.x_a[TREND_PAIR], p.capacity_as / 3600.0)
     if direction != h.direction or row_is_complete(h, p):
         complete_row(h)
         if direction != h.direction:
@@ -154,7 +154,7 @@ def count_window(h: Record, f: Record, p: Record) -> None:
     h.charge_as += w.charge_as
     h.throughput_soc += w.throughput_as / p.capacity_as
     h.charge_variance_as2 += w.between_as2 + w.rounded_as2 + w.unknown_as * w.unknown_as
-    moved_soc = f.x_a[TREND] * w.time_s / p.capacity_as
+    moved_soc = f.x_a[TREND_PAIR] * w.time_s / p.capacity_as
     for k in range(2):
         share = 1.0 - math.exp(-abs(moved_soc) / HYSTERESIS_SOC[k])
         h.hysteresis[k] -= share * (h.hysteresis[k] + math.copysign(1.0, moved_soc))
@@ -204,8 +204,8 @@ def complete_row(h: Record) -> None:
 @njit(cache=True)
 def append_row(h: Record) -> Record:
     """Return the next row of the buffer, initialized without a known SOC. A full buffer loses its oldest row."""
-    if h.count == COMPLETED_ROWS:
-        for j in range(COMPLETED_ROWS - 1):
+    if h.count == MAX_ROWS:
+        for j in range(MAX_ROWS - 1):
             h.rows[j] = h.rows[j + 1]
         h.count -= 1
     row = h.rows[h.count]
@@ -235,4 +235,4 @@ def add_reference(h: Record, kind: int, soc: float, std: float) -> None:
 @njit(cache=True)
 def needs_caller(h: Record) -> bool:
     """Return True if the caller must take the completed rows, or if ``event_s`` has passed."""
-    return h.enabled != 0 and (h.count >= COMPLETED_ROWS - FREE_ROWS or h.elapsed_s >= h.event_s)
+    return h.enabled != 0 and (h.count >= MAX_ROWS - MIN_FREE_ROWS or h.elapsed_s >= h.event_s)

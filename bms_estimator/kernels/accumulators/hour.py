@@ -15,7 +15,7 @@ HOUR_SUMS = np.dtype(
         ("last_a", "f8"),  # current of the last sample [A]
         ("last_w", "f8"),  # power of the last sample [W]
         ("step_s", "f8"),  # time between the last two samples [s]
-        ("rest_s", "f8"),  # time with almost no current [s]
+        ("rest_s", "f8"),  # duration of the present rest, without gaps [s]
         ("outliers_before", "i8"),  # outlier counter of the estimator at the start of the hour
         ("searches_before", "i8"),  # counter of SOC re-initializations at the start of the hour
         ("samples", "i8"),  # accepted samples; this field and all later ones restart with each hour (HOURLY_FIELDS)
@@ -56,7 +56,7 @@ def accumulate_hour(sums: Records, trace: Records, new_clock: bool, gap_s: float
         sums: Shape (1,), dtype HOUR_SUMS; updated in place.
         trace: Shape (n,), dtype TRACE.
         new_clock: True if the time stamps have another time base than those of earlier blocks.
-        gap_s: Minimum duration of a gap, unless the previous step was about as long [s].
+        gap_s: Minimum duration of a gap [s]. A gap is also longer than ``GAP_RATIO`` previous steps.
         rest_a: Maximum current that counts as zero [A].
     """
     h = sums[0]
@@ -70,13 +70,13 @@ def accumulate_hour(sums: Records, trace: Records, new_clock: bool, gap_s: float
 
 @njit(cache=True)
 def add_step(h: Record, x: Record, has_previous: bool, gap_s: float, rest_a: float) -> None:
-    """Add charge, energy and time since the previous sample by a trapezoid. Over a gap, count only the gap.
+    """Add charge, energy and time since the previous sample by the trapezoidal rule; count a gap instead if there is one.
 
     Args:
         h: Record of HOUR_SUMS.
         x: Record of TRACE.
-        has_previous: True if a previous sample with an equal time base exists.
-        gap_s: Minimum duration of a gap, unless the previous step was about as long [s].
+        has_previous: True if a previous sample with the same time base exists.
+        gap_s: Minimum duration of a gap [s]. A gap is also longer than ``GAP_RATIO`` previous steps.
         rest_a: Maximum current that counts as zero [A].
     """
     power_w, dt_s = x.voltage_v * x.current_a, x.time_s - h.last_s

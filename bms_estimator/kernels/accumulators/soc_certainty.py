@@ -13,7 +13,7 @@ MIN_UNKNOWN_STD = 0.12
 
 @njit(cache=True)
 def is_soc_known(soc_std: float, was_known: bool) -> bool:
-    """Return True if an SOC with this std is known. An SOC without a std, by coulomb counting alone, counts as known.
+    """Return True if an SOC with this std is known. An SOC from coulomb counting alone has no std and counts as known.
 
     Args:
         soc_std: Std of the SOC; NaN without the identifier.

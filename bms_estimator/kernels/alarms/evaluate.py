@@ -2,6 +2,8 @@
 
 An alarm is raised after its delay, ends after its clear delay and, if it latches, after an acknowledgement. It is not watched
 while a quantity that it needs is lost.
+
+``a`` is a record of ALARMS, ``p`` of SETTINGS, ``b`` of PART, ``e`` of ESTIMATOR_STATE.
 """
 
 import math
@@ -72,11 +74,11 @@ def evaluate(
         part: Shape (1,), dtype PART; its results are updated.
         estimator: State of the estimator after the samples, shape (1,), dtype ESTIMATOR_STATE.
         samples: Shape (n,), dtype SAMPLE. A sample without a time has no effect.
-        cells_v: Cell voltages, shape (n, m) [V]; of another length without any.
+        cells_v: Cell voltages, shape (n, cells) [V]; an array of another length if none are measured.
         trace: Estimates of the accepted samples, dtype TRACE.
         cutoff_risk: Probability of the cut-off within 5 min at each row of ``trace``, 0..1, or a single one for all of them;
             NaN without a forecast.
-        scratch: Shape (6, n) or longer, and at least ``SAMPLE_ALARMS``; overwritten.
+        scratch: Six rows of at least n and at least ``SAMPLE_ALARMS`` elements; overwritten.
         log: Receives the changes, dtype LOG, from ``part.logged`` on.
 
     Returns:
@@ -98,7 +100,9 @@ def evaluate(
     if trace.shape[0]:
         _evaluate_estimates(a, limits, p, b, trace, cutoff_risk, e.checks.suspects & p.model_suspects != 0, log)
     if not math.isnan(b.weak_cell_std) and not math.isnan(end_s):
-        step_s = step_intervals(a.bank, end_s, math.inf)[1]  # no gap, because a weak cell remains weak
+        step_s = step_intervals(a.bank, end_s, math.inf)[
+            1
+        ]  # gaps count toward the delay, because a weak cell remains weak
         update(states[WEAK_CELL], limits[WEAK_CELL], p, b, log, WEAK_CELL, end_s, step_s, b.weak_cell_std, 0)
     if not math.isnan(b.cells_at_s):
         step_s = step_intervals(a.cells, b.cells_at_s, CELLS_GAP_S)[1]
@@ -169,8 +173,8 @@ def _evaluate_samples(
 ) -> float:
     """Evaluate the alarms on measured values. Return the time of the last sample [s]; NaN without one.
 
-    Row 0 of ``scratch`` becomes the time for which the value before each sample holds, -1 for a sample without a time [s], and
-    rows 1 to 4 the numbers of its values.
+    Row 0 of ``scratch`` receives the observed interval before each sample, or -1 for a sample without a time [s]. Rows 1 to 4
+    receive the number of values of each measured quantity.
     """
     states, expected_cells, values = a.states, a.quantities[CELLS].max_count, scratch[5]
     end_s = math.nan

@@ -1,4 +1,7 @@
-"""Intervals between samples, loss of measured quantities, and the alarms that cannot be watched because of it."""
+"""Intervals between samples, loss of measured quantities, and the alarms that cannot be watched because of it.
+
+``a`` is a record of ALARMS, ``p`` of SETTINGS, ``b`` of PART, ``s`` of ALARM, ``d`` of LIMITS.
+"""
 
 import math
 
@@ -9,18 +12,18 @@ from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 MAX_SPACING_FRACTION = 0.5
-"""Maximum interval between two values that ends a loss although samples between them lack the quantity, as a fraction of
-``lost_s``. Below 1, so that a sensor that is almost lost again stays lost."""
+"""Values of an intermittent sensor end a loss if their intervals are at most this fraction of ``lost_s``. It is below 1, so that
+a sensor that is almost lost again remains lost."""
 MIN_RESTORED_S = 10.0
-"""Minimum time of samples with values that ends a loss [s], also if ``lost_s`` is shorter: a loose wire must not make a relay
-chatter."""
+"""A loss ends after values have arrived for this time, or for ``lost_s`` if that is longer [s]. A loose wire must not make a
+relay chatter."""
 RECENT_STEPS = 4.0
 """Maximum time between two intervals above ``gap_s`` that count as regular, in multiples of the longer interval."""
 
 
 @njit(cache=True)
 def step_intervals(s: Record, at_s: float, gap_s: float) -> tuple[float, float]:
-    """Return the interval before a time, and the part of it for which a value holds, which is 0 in a gap [s].
+    """Return the interval since the previous time, and the observed part of it, which is 0 for a gap [s].
 
     A gap is much longer than the longest recent interval. Samples that arrive in bursts have one long interval before each
     burst. From the second burst on, these intervals do not count as gaps.
@@ -62,18 +65,10 @@ def update_quantities(
 ) -> None:
     """Update the loss of measured quantities, and the alarms that cannot be watched because of it.
 
-    Args:
-        alarms: As for ``evaluate.evaluate``, like the arguments that follow.
-        limits: Definitions of the alarms.
-        settings: Settings.
-        part: Values beside the samples.
-        samples: The samples.
-        scratch: Times and numbers of values, from ``evaluate``.
-        log: Receives the changes.
-        end_s: Time of the last sample [s].
+    ``end_s`` is the time of the last sample [s], and ``evaluate.evaluate`` describes the other arguments.
     """
     a, p = alarms[0], settings[0]
-    changed_s = math.nan  # time of the first loss or return
+    changed_s = math.nan  # time of the first loss or end of a loss
     for q in range(QUANTITIES):
         for j in range(samples.shape[0]):
             step_s, count = scratch[0, j], int(scratch[1 + q, j])
@@ -81,7 +76,7 @@ def update_quantities(
                 changed_s = samples[j].time_s
     update_unwatched(alarms, limits, part, log, end_s if math.isnan(changed_s) else changed_s)
     if not math.isnan(changed_s) and is_blinded(a.states, limits, lost_quantities(a)):
-        # without the delay of the alarm, because a quantity has been missing for ``lost_s``
+        # the delay of the alarm is skipped, because the quantity has been missing for ``lost_s`` already
         s, d, b = a.states[SENSOR_FAULT], limits[SENSOR_FAULT], part[0]
         raise_now(s, d, b, log, SENSOR_FAULT, changed_s, changed_s + b.wall_offset_s, math.nan)
 
@@ -90,9 +85,9 @@ def update_quantities(
 def update_unwatched(alarms: Records, limits: Records, part: Records, log: Records, at_s: float) -> None:
     """Update the alarms that cannot be watched at ``at_s`` [s], because a quantity is lost or no samples arrive.
 
-    ``evaluate.evaluate`` describes the other arguments. An alarm of which a quantity was never measured counts as watched, because
-    it could not be evaluated before either. A critical alarm whose delay runs stays unwatched, so that a relay does not close before
-    the alarm is raised.
+    ``evaluate.evaluate`` describes the other arguments. An alarm counts as watched if a quantity that it needs was never
+    measured, because it could not be evaluated before either. A critical alarm whose delay runs stays unwatched, so that a
+    relay does not close before the alarm is raised.
     """
     a, b = alarms[0], part[0]
     lost = lost_quantities(a)
@@ -129,7 +124,10 @@ def is_blinded(states: Records, limits: Records, lost: int) -> bool:
 
 @njit(cache=True)
 def _step_quantity(s: Record, step_s: float, count: int, lost_s: float) -> bool:
-    """Process the number of values of a quantity in a sample, negative for unusable ones. Return True if ``lost`` has changed."""
+    """Process the number of values of a quantity in a sample, negative for unusable ones. Return True if ``lost`` has changed.
+
+    ``s`` is a record of QUANTITY.
+    """
     s.max_count = max(s.max_count, count)
     was_lost, follows_value = s.lost, not s.is_missing
     s.value_age_s += step_s

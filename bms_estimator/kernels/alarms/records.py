@@ -10,7 +10,7 @@ NAMES = (
     *("cell_short", "cell_sensor_fault", "weak_cell", "sensor_fault"),
     *("collapse_risk", "hook_failed", "alarm_state_lost"),
 )
-"""Names of the alarms by their positions. States are saved by position, so that further alarms are appended."""
+"""Names of the alarms by their positions. States are saved by position, so new alarms must be appended."""
 SAMPLE_ALARMS = 11
 """Number of alarms on the values of a sample, which come first."""
 LINK_LOST = NAMES.index("link_lost")
@@ -55,7 +55,7 @@ INTERVALS = np.dtype(
     ],
     align=True,
 )
-"""Intervals between times."""
+"""State of ``step_intervals``."""
 QUANTITY = np.dtype(
     [
         ("max_count", "i8"),  # largest number of values in a sample; 0: never measured
@@ -126,7 +126,8 @@ SETTINGS = np.dtype(
         ("range_a", "f8"),  # highest usual current [A]
         ("low_v", "f8"),  # lowest and highest usual voltage of the pack [V]
         ("high_v", "f8"),
-        ("wire_v", "f8"),  # voltages that show a broken wire beside an alarm of the opposite side [V]
+        # voltages beyond which a wire may be broken, so that the alarm of the opposite limit is uncertain [V]
+        ("wire_v", "f8"),
         ("wire_low_cell_v", "f8"),
         ("wire_high_cell_v", "f8"),
         ("sensor_suspects", "i8"),  # bits of the input faults that raise ``sensor_fault``
@@ -143,7 +144,7 @@ PART = np.dtype(
         ("reading_v", "f8"),  # largest error of a reading of a cell [V]
         ("weak_cell_std", "f8"),  # deviation of a bank's last discharge from its reference [std]; NaN: unknown
         ("lost", "i8"),  # number of samples since start that were lost on the line
-        ("is_silent", "i8"),  # 1: no samples arrive, or have arrived for a short time only
+        ("is_silent", "i8"),  # 1: no samples arrive, or they have arrived again for a short time only
         ("cells_unusable", "i8"),  # 1: samples without cell voltages have some that cannot be used
         # duration of the samples since the start or the last silence, without gaps; NaN during a silence [s]; updated
         ("watched_s", "f8"),
@@ -155,7 +156,7 @@ PART = np.dtype(
     ],
     align=True,
 )
-"""Values beside the samples of a part of a block, and results."""
+"""Inputs of the evaluation of a part of a block, beside its samples, and results."""
 LOG = np.dtype(
     [
         ("alarm", "i8"),  # position in ``NAMES``

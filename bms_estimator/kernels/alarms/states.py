@@ -38,7 +38,7 @@ def update(
     if not d.monitored:
         return
     value, limit = d.sign * measured, d.sign * d.limit
-    if value >= limit:  # the acknowledgment did not cover the loss of this sensor
+    if value >= limit:  # uncertain values after this measured one need another acknowledgment
         s.is_uncertain, s.accepts_uncertain = 0, 0
     else:
         s.is_uncertain = is_uncertain
@@ -65,7 +65,7 @@ def update(
 
 @njit(cache=True)
 def _next_state(s: Record, d: Record, b: Record, log: Records, k: int, at_s: float, value: float) -> None:
-    """Change to the next state after its delay. ``value`` is that of an upper limit; ``update`` describes the others."""
+    """Change to the next state after its delay. ``value`` is multiplied by ``d.sign``; ``update`` describes the others."""
     if not s.raised:
         raise_now(s, d, b, log, k, at_s, at_s + b.wall_offset_s, d.sign * value if math.isfinite(value) else math.nan)
     elif s.cause_cleared:  # the cause has returned

@@ -1,4 +1,8 @@
-"""Values of a sample that the alarms compare with their limits, and values that cannot be true."""
+"""Values of a sample that the alarms compare with their limits, and values that cannot be true.
+
+``p`` is a record of SETTINGS, ``x`` of SAMPLE. ``cells`` is the number of measured cell voltages, and ``low_v``, ``high_v`` and
+``mean_v`` are their minimum, maximum and mean [V].
+"""
 
 import math
 
@@ -54,7 +58,7 @@ def possible_values(
         bad, voltage_v = 1 << VOLTAGE, math.nan
     if differs and pack_is_usual and not cells_are_usual:
         bad |= 1 << CELLS
-    is_milli = MILLI * p.low_v <= x.voltage_v <= MILLI * p.high_v  # then the current is, too
+    is_milli = MILLI * p.low_v <= x.voltage_v <= MILLI * p.high_v  # then the current has the wrong unit, too
     if abs(x.current_a) > (p.range_a if is_milli else p.max_a) and not x.status & _CURRENT_SATURATED:
         bad |= 1 << CURRENT
         current_a = math.nan
@@ -102,8 +106,8 @@ def uncertain_values(
 ) -> int:
     """Return the bits of the alarms whose true value may be beyond the limit although the measured one is not.
 
-    Heat destroys probes, a broken wire hides a voltage or lets it float to an end of the range, and a dead current sensor reads
-    an end of its range.
+    Bit k belongs to ``NAMES[k]``. Heat destroys probes. A broken wire hides a voltage or lets it float to an end of the range.
+    A dead current sensor reads an end of its range.
     """
     has_probe_fault = (x.status & _PROBE_FAULT) != 0
     lacks_cell = 0 < cells < expected_cells

@@ -3,21 +3,21 @@
 from bms_estimator.model.unmeasured_time import UNMEASURED_S
 from bms_estimator.numba_cache import njit
 
-SLOW_S = 2.0
+RAMP_STEP_S = 2.0
 """Interval between samples above which the current counts as a ramp, and its charge as uncertain [s]. The current may
 deviate from a straight line between the samples."""
 GAP_RATIO = 3.0
 """Minimum ratio of a gap to the previous step, so that slow sampling does not count as gaps."""
-PERIODS = 2.5
-"""Maximum regular step in multiples of the sample period, because a regular source may be late or lose a sample."""
+MAX_STEP_PERIODS = 2.5
+"""Maximum regular step in multiples of the sample period. A regular source may be late or lose a sample."""
 
 
 @njit(cache=True)
 def interpolated_current(dt_s: float, before_a: float, now_a: float, unmeasured_s: float = UNMEASURED_S) -> float:
     """Return the mean current over a step of ``dt_s`` [A].
 
-    The current is linear between samples. Over an unmeasured step it is the smaller of both ends, or 0 if their signs
-    differ.
+    The current is linear between samples. Over a step above ``unmeasured_s`` it is the end of smaller magnitude, or 0 if the
+    signs of the ends differ.
     """
     if dt_s <= unmeasured_s:
         return 0.5 * (before_a + now_a)

@@ -1,6 +1,6 @@
-"""Fuel cell model after section 7.3 of the thesis: Nernst voltage with Tafel, ohmic and concentration losses, and a double layer.
+"""Fuel cell model of section 7.3 of the thesis: Nernst voltage with Tafel, ohmic and concentration losses, and a double layer.
 
-A stack of n cells is one two-terminal object with the current i, positive when the stack delivers power::
+A stack of n cells is modeled as one element. Its current i is positive when the stack delivers power::
 
     y = E - v - r i
     E = n (1.229 - 8.5e-4 (T - 298.15) + 4.3085e-5 T (ln p_H2 + 1/2 ln p_O2))    Nernst, Mann et al. (2000)
@@ -31,18 +31,18 @@ NAMES = (
     "limiting_current_a",
     "internal_current_a",
 )
-"""Names of the identified parameters r, A, a, C, B, i_L, i_n. theta is ln of each value over that of the file."""
+"""Names of the identified parameters r, A, a, C, B, i_L, i_n. theta is the logarithm of each value over the file's value."""
 
 R, TAFEL, ACTIVATION, C_DL, B, LIMIT, INTERNAL = range(len(NAMES))
-"""Indices of the parameters in theta and ``given``."""
+"""Indices of the parameters in theta and ``constants``."""
 E = len(NAMES)
-"""Index of E in ``given``."""
+"""Index of E in ``constants``."""
 CELLS, TEMPERATURE, HYDROGEN, OXYGEN = range(1 + len(NAMES), 5 + len(NAMES))
 """Indices into the constants of a file, shape (16,), after the parameters at 1..7: cells in series, temperature of the
 file's parameters [C], partial pressures [atm]."""
 BARRIER_V = 0.948
-"""Activation energy of the cathode reaction over its transferred charge, per cell [V]: a at 0 K for an Arrhenius
-dependence of the exchange current; xi_1 of Mann et al. (2000)."""
+"""Activation energy of the cathode reaction per transferred charge, of one cell [V]: xi_1 of Mann et al. (2000). With an
+Arrhenius dependence of the exchange current, it is the parameter a at 0 K."""
 MEMBRANE_K = 1268.0
 """Temperature coefficient of the membrane's conductivity, e^(-1268 / T), by Springer et al. (1991) [K]."""
 MIN_REMAINDER = 0.02
@@ -63,29 +63,29 @@ def nernst(temperature_k: float, hydrogen_atm: float, oxygen_atm: float) -> floa
 
 
 @njit(cache=True)
-def load_constants(given: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - the cell model's function needs the SOC
-    """Write the parameters and E at ``temperature_c`` [C] to ``given``; ``p`` is a record of ESTIMATOR_SETTINGS."""
-    load_file_constants(given, p.learning.file, temperature_c)
+def load_constants(constants: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - shared signature
+    """Write the parameters and E at ``temperature_c`` [C] to ``constants``; ``p`` is a record of ESTIMATOR_SETTINGS."""
+    load_file_constants(constants, p.learning.file, temperature_c)
 
 
 @njit(cache=True)
-def load_file_constants(given: Floats, file: Floats, temperature_c: float) -> None:
-    """Write the parameters and E at ``temperature_c`` [C] to ``given``.
+def load_file_constants(constants: Floats, file: Floats, temperature_c: float) -> None:
+    """Write the parameters and E at ``temperature_c`` [C] to ``constants``.
 
     Args:
-        given: Shape (8,), written.
+        constants: Shape (8,), written.
         file: Constants of the file, shape (16,).
         temperature_c: Temperature of the stack [C]; NaN: the file's temperature.
     """
     for j in range(len(NAMES)):
-        given[j] = file[1 + j]
+        constants[j] = file[1 + j]
     file_k = 273.15 + file[TEMPERATURE]
     kelvin = file_k if math.isnan(temperature_c) else 273.15 + temperature_c
     ratio = kelvin / file_k
-    given[R] *= math.exp(MEMBRANE_K * (1.0 / kelvin - 1.0 / file_k))
-    given[TAFEL] *= ratio  # R T / (alpha F)
-    given[ACTIVATION] = given[ACTIVATION] * ratio + file[CELLS] * BARRIER_V * (1.0 - ratio)
-    given[E] = file[CELLS] * nernst(kelvin, file[HYDROGEN], file[OXYGEN])
+    constants[R] *= math.exp(MEMBRANE_K * (1.0 / kelvin - 1.0 / file_k))
+    constants[TAFEL] *= ratio  # R T / (alpha F)
+    constants[ACTIVATION] = constants[ACTIVATION] * ratio + file[CELLS] * BARRIER_V * (1.0 - ratio)
+    constants[E] = file[CELLS] * nernst(kelvin, file[HYDROGEN], file[OXYGEN])
 
 
 @njit(cache=True)
@@ -95,41 +95,46 @@ def reaction_current(current_a: float, internal_a: float) -> float:
 
 
 @njit(cache=True)
-def steady_overpotential(theta: Floats, given: Floats, current_a: float, slope: Floats) -> float:
+def steady_overpotential(theta: Floats, constants: Floats, current_a: float, slope: Floats) -> float:
     """Return v_inf(I) [V]; write its derivatives by theta to ``slope``, shape (8,)."""
-    tafel_v, activation_v = given[TAFEL] * math.exp(theta[TAFEL]), given[ACTIVATION] * math.exp(theta[ACTIVATION])
-    b_v, limit_a = given[B] * math.exp(theta[B]), given[LIMIT] * math.exp(theta[LIMIT])
-    internal_a = given[INTERNAL] * math.exp(theta[INTERNAL])
+    tafel_v, activation_v = (
+        constants[TAFEL] * math.exp(theta[TAFEL]),
+        constants[ACTIVATION] * math.exp(theta[ACTIVATION]),
+    )
+    b_v, limit_a = constants[B] * math.exp(theta[B]), constants[LIMIT] * math.exp(theta[LIMIT])
+    internal_a = constants[INTERNAL] * math.exp(theta[INTERNAL])
     reaction_a = reaction_current(current_a, internal_a)
     remainder = 1.0 - reaction_a / limit_a
     is_limited = remainder < MIN_REMAINDER
     remainder = max(remainder, MIN_REMAINDER)
-    last_slope = 0.0 if is_limited else b_v * reaction_a / (limit_a * remainder)  # d / d ln I of the last term of v_inf
+    concentration_slope = (
+        0.0 if is_limited else b_v * reaction_a / (limit_a * remainder)
+    )  # derivative of the loss by ln I
     slope[:] = 0.0
     slope[TAFEL] = tafel_v * math.log(reaction_a)
     slope[ACTIVATION] = activation_v
     slope[B] = -b_v * math.log(remainder)
-    slope[LIMIT] = -last_slope
-    slope[INTERNAL] = (tafel_v + last_slope) * internal_a / reaction_a
+    slope[LIMIT] = -concentration_slope
+    slope[INTERNAL] = (tafel_v + concentration_slope) * internal_a / reaction_a
     return activation_v + slope[TAFEL] + slope[B]
 
 
 @njit(cache=True)
-def advance(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, dt_s: float) -> None:
+def advance(x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float, dt_s: float) -> None:
     """Advance the overpotential and its sensitivities by ``dt_s`` under a constant current, exactly.
 
     Args:
         x: States [V], shape (2,); only the first, v, is used. Updated.
         dx: d x / d theta, shape (2, 8). Updated.
-        theta: ln of each parameter over the file's, shape (8,).
-        given: The file's parameters, then E [V], shape (8,).
+        theta: Logarithm of each parameter relative to the file's value, shape (8,).
+        constants: The file's parameters, then E [V], shape (8,).
         current_a: Current over the step [A], positive when the stack delivers power.
         dt_s: Step [s].
     """
     slope = dx[1]  # scratch space: the row of the unused second state
-    v_inf = steady_overpotential(theta, given, current_a, slope)
-    tafel_v, farad = given[TAFEL] * math.exp(theta[TAFEL]), given[C_DL] * math.exp(theta[C_DL])
-    internal_a = given[INTERNAL] * math.exp(theta[INTERNAL])
+    v_inf = steady_overpotential(theta, constants, current_a, slope)
+    tafel_v, farad = constants[TAFEL] * math.exp(theta[TAFEL]), constants[C_DL] * math.exp(theta[C_DL])
+    internal_a = constants[INTERNAL] * math.exp(theta[INTERNAL])
     reaction_a = reaction_current(current_a, internal_a)
     taus = dt_s * reaction_a / (tafel_v * farad)  # step in multiples of the time constant A C / I
     decay = math.exp(-taus)
@@ -149,26 +154,26 @@ def advance(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: floa
 
 
 @njit(cache=True)
-def output(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, psi: Floats) -> float:
+def output(x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float, psi: Floats) -> float:
     """Return the terminal voltage y [V]; write its derivatives by theta to ``psi``, shape (8,).
 
     The other arguments are those of ``advance``. ``psi`` is 0 for a charging current above i_n, because such a current is
     a measurement error and gives no information on parameters.
     """
-    drop_v = given[R] * math.exp(theta[R]) * current_a
+    drop_v = constants[R] * math.exp(theta[R]) * current_a
     for j in range(psi.shape[0]):
         psi[j] = -dx[0, j]
     psi[R] -= drop_v
-    if current_a + given[INTERNAL] * math.exp(theta[INTERNAL]) < 0.0:
+    if current_a + constants[INTERNAL] * math.exp(theta[INTERNAL]) < 0.0:
         psi[:] = 0.0
-    return given[E] - x[0] - drop_v
+    return constants[E] - x[0] - drop_v
 
 
 @njit(cache=True)
-def steady_state(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
+def steady_state(x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float) -> None:
     """Set the state and its sensitivities to the steady state under ``current_a``. Arguments are those of ``advance``."""
     dx[1] = 0.0
-    x[0], x[1] = steady_overpotential(theta, given, current_a, dx[0]), 0.0
+    x[0], x[1] = steady_overpotential(theta, constants, current_a, dx[0]), 0.0
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ def open_loop(
 
     Args:
         file: Constants of the file, shape (16,).
-        theta: ln of each parameter over the file's, shape (8,).
+        theta: Logarithm of each parameter relative to the file's value, shape (8,).
         time_s: Shape (n,), increasing [s].
         current_a: Shape (n,), positive when the stack delivers power [A].
         temperature_c: Shape (n,), NaN without a sensor [C].
@@ -26,15 +26,15 @@ def open_loop(
     """
     n = time_s.size
     voltage_v, psi = np.empty(n), np.zeros((n, theta.size))
-    x, dx, given = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)
+    x, dx, constants = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)
     for j in range(n):
-        load_file_constants(given, file, temperature_c[j])
+        load_file_constants(constants, file, temperature_c[j])
         if j == 0:
-            steady_state(x, dx, theta, given, current_a[0])
+            steady_state(x, dx, theta, constants, current_a[0])
         else:
             dt_s = time_s[j] - time_s[j - 1]
-            advance(x, dx, theta, given, interpolated_current(dt_s, current_a[j - 1], current_a[j]), dt_s)
-        voltage_v[j] = output(x, dx, theta, given, current_a[j], psi[j])
+            advance(x, dx, theta, constants, interpolated_current(dt_s, current_a[j - 1], current_a[j]), dt_s)
+        voltage_v[j] = output(x, dx, theta, constants, current_a[j], psi[j])
     return voltage_v, psi
 
 
@@ -46,9 +46,9 @@ def polarisation(file: Floats, theta: Floats, current_a: Floats, temperature_c: 
     """
     n = current_a.size
     voltage_v, psi = np.empty(n), np.zeros((n, theta.size))
-    x, dx, given = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)
+    x, dx, constants = np.zeros(2), np.zeros((2, theta.size)), np.zeros(theta.size)
     for j in range(n):
-        load_file_constants(given, file, temperature_c[j])
-        steady_state(x, dx, theta, given, current_a[j])
-        voltage_v[j] = output(x, dx, theta, given, current_a[j], psi[j])
+        load_file_constants(constants, file, temperature_c[j])
+        steady_state(x, dx, theta, constants, current_a[j])
+        voltage_v[j] = output(x, dx, theta, constants, current_a[j], psi[j])
     return voltage_v, psi

@@ -2,8 +2,8 @@
 
 Numbers in parentheses are equations of the thesis.
 
-The current between two samples is interpolated as in the filter (``interpolated_current``, ``ramp_correction``) for a
-source with a period of at most a minute.
+The current between two samples is interpolated (``interpolated_current``, ``ramp_correction``) as in the filter for a source
+with a period of at most a minute.
 """
 
 import math
@@ -12,11 +12,11 @@ import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts, rc_step
 from bms_estimator.kernels.cell_model.current_interpolation import (
-    SLOW_S,
+    RAMP_STEP_S,
     interpolated_current,
     ramp_correction,
 )
-from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS, TREND
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS, TREND_PAIR
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.unmeasured_time import UNMEASURED_S
 from bms_estimator.numba_cache import njit
@@ -47,7 +47,7 @@ def branch_currents_from(first_a: Floats, time_s: Floats, current_a: Floats) -> 
     for j in range(1, time_s.size):
         dt_s = time_s[j] - time_s[j - 1]
         mean_a = interpolated_current(dt_s, current_a[j - 1], current_a[j])
-        ramp_a = current_a[j] - current_a[j - 1] if SLOW_S < dt_s <= UNMEASURED_S else 0.0
+        ramp_a = current_a[j] - current_a[j - 1] if RAMP_STEP_S < dt_s <= UNMEASURED_S else 0.0
         for k in range(BRANCHES):
             decay = math.exp(-dt_s / TAUS[k])
             x[j, k] = mean_a + (x[j - 1, k] - mean_a) * decay + ramp_correction(ramp_a, dt_s / TAUS[k], decay)
@@ -56,13 +56,13 @@ def branch_currents_from(first_a: Floats, time_s: Floats, current_a: Floats) -> 
 
 @njit(cache=True)
 def hysteresis(time_s: Floats, soc: Floats, length: float, first: float) -> Floats:
-    """Return the hysteresis state h over the counted SOC: towards 1 in a charge, towards -1 in a discharge.
+    """Return the hysteresis state h, which approaches 1 during a charge and -1 during a discharge.
 
-    As in the filter, h follows the SOC filtered with the time constant of RC pair ``TREND``.
+    As in the filter, h follows the SOC filtered with the time constant of RC pair ``TREND_PAIR``.
 
     Args:
         time_s: Shape (n,), increasing [s].
-        soc: Shape (n,), counted.
+        soc: SOC by coulomb counting, shape (n,).
         length: Charge constant of the exponential approach to 1 or -1 [SOC].
         first: h at the first sample.
 
@@ -72,7 +72,7 @@ def hysteresis(time_s: Floats, soc: Floats, length: float, first: float) -> Floa
     h = np.full(soc.size, first)
     filtered_soc = soc[0]
     for j in range(1, soc.size):
-        change = (1.0 - math.exp(-(time_s[j] - time_s[j - 1]) / TAUS[TREND])) * (soc[j] - filtered_soc)
+        change = (1.0 - math.exp(-(time_s[j] - time_s[j - 1]) / TAUS[TREND_PAIR])) * (soc[j] - filtered_soc)
         filtered_soc += change
         decay = math.exp(-abs(change) / length)
         h[j] = decay * h[j - 1] + math.copysign(1.0 - decay, change)
@@ -88,7 +88,7 @@ def two_branches(time_s: Floats, current_a: Floats, soc: Floats, a: Floats) -> F
     Args:
         time_s: Shape (n,), increasing [s].
         current_a: Shape (n,), discharge positive [A].
-        soc: Shape (n,), counted.
+        soc: SOC by coulomb counting, shape (n,).
         a: a1..a15 at index 1..15.
 
     Returns:

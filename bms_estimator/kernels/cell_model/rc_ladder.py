@@ -18,13 +18,14 @@ BRANCHES = len(TAU_S)
 RESISTANCES = 1 + BRANCHES
 """Number of resistances: the series resistance, then that of each RC pair."""
 LOW_ACTIVATION_ENERGY = 12e3
-"""Activation energy of the weakly temperature-dependent part of each resistance, as in the electrolyte [J/mol]."""
+"""Activation energy of the weak part of each resistance [J/mol]. This part depends weakly on temperature, like the electrolyte's
+resistance."""
 HIGH_ACTIVATION_ENERGY = 45e3
-"""Activation energy of the strongly temperature-dependent part of each resistance, as in reaction and diffusion
-[J/mol]."""
+"""Activation energy of the strong part of each resistance [J/mol]. This part depends strongly on temperature, like those of
+reaction and diffusion."""
 HYSTERESIS_ACTIVATION_ENERGY = 8e3
-"""Activation energy of the hysteresis [J/mol]: the hysteresis between C/30 curves of an LFP cell, without the drop of
-its RC network, was 1.2 and 1.7 times as large at 5 and -15 C as at 25 C."""
+"""Activation energy of the hysteresis [J/mol]. Between C/30 curves of an LFP cell, less the drop of its RC network, the
+hysteresis at 5 and -15 C was 1.2 and 1.7 times that at 25 C."""
 GAS_CONSTANT = 8.314462618
 """Molar gas constant [J/(mol K)]."""
 REFERENCE_C = 25.0
@@ -33,16 +34,15 @@ GRID = 41
 """Number of nodes of resistances, entropy and hysteresis, evenly spaced over SOC 0..1."""
 
 WEAK_SHARE = (0.80, 0.87, 0.94, 0.78, 0.64, 0.59, 0.57)
-"""Default fraction of each resistance with activation energy ``LOW_ACTIVATION_ENERGY``, for captures at a single temperature. The values
-are those of an 18650 NCA cell from -10 to 33 C, mean over SOC 0.3 to 1. An LFP cell from -15 to 25 C has 0.8, 1, 0.9,
-0.75, 0.7, 0.6, 0.6."""
+"""Default weak part as a fraction of each resistance, for captures at a single temperature. The values are those of an 18650
+NCA cell from -10 to 33 C, mean over SOC 0.3 to 1. An LFP cell from -15 to 25 C has 0.8, 1, 0.9, 0.75, 0.7, 0.6, 0.6."""
 WEAK_FACTOR_SOC = (0.0, 0.1, 0.2, 0.3, 0.45)
 """SOC nodes of ``WEAK_FACTOR``."""
 WEAK_FACTOR = (0.45, 0.5, 0.8, 0.9, 1.0)
 """Factor on ``WEAK_SHARE`` near empty. At SOC 0.2 and 0.1 the measured factor is 0.73 and 0.14 in the NCA cell, 0.97
 and 0.92 in the LFP cell."""
 
-TREND = 3
+TREND_PAIR = 3
 """Index of the RC pair whose filtered current decides between charge and discharge: that of 120 s."""
 
 TAUS = np.array(TAU_S)
@@ -50,7 +50,7 @@ TAUS = np.array(TAU_S)
 
 
 def weak_share(soc: Floats) -> Floats:
-    """Return the default weak fraction of each resistance at ``soc``, shape (RESISTANCES, n)."""
+    """Return the default weak part as a fraction of each resistance at ``soc``, shape (RESISTANCES, n)."""
     return np.outer(np.array(WEAK_SHARE), np.interp(soc, WEAK_FACTOR_SOC, WEAK_FACTOR))
 
 
@@ -74,8 +74,8 @@ def resistances(soc: float, weak_ohm: Floats, strong_ohm: Floats, weak: float, s
 
     Args:
         soc: State of charge.
-        weak_ohm: Shape (GRID, RESISTANCES), part with activation energy ``LOW_ACTIVATION_ENERGY``, at 25 C [ohm].
-        strong_ohm: Shape (GRID, RESISTANCES), part with activation energy ``HIGH_ACTIVATION_ENERGY``, at 25 C [ohm].
+        weak_ohm: Shape (GRID, RESISTANCES), weak part at 25 C [ohm].
+        strong_ohm: Shape (GRID, RESISTANCES), strong part at 25 C [ohm].
         weak: ``arrhenius(LOW_ACTIVATION_ENERGY, T)``.
         strong: ``arrhenius(HIGH_ACTIVATION_ENERGY, T)``.
         ohm: Shape (RESISTANCES,), written.

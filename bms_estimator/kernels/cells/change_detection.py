@@ -1,9 +1,9 @@
 """Detection of changes that the filter of a cell does not expect: generalized likelihood ratios of its innovations.
 
 A. Willsky and H. Jones, "A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems",
-IEEE Transactions on Automatic Control 21 (1976), pages 108-112. The hypotheses are RISE and FALL of the self-discharge, and DRAIN by a
-balancer. ``response`` is the error that the filter's state would have, had a change of size 1 begun at the last restart of the
-hypothesis. Without a change, the innovations are white, and ``score`` over the root of ``information`` has a standard normal
+IEEE Transactions on Automatic Control 21 (1976), pages 108-112. The hypotheses are RISE and FALL of the self-discharge, and DRAIN
+by a balancer. ``response`` is the error that the filter's state would have, had a change of size 1 begun at the last restart of
+the hypothesis. Without a change, the innovations are white, and ``score`` over the root of ``information`` has a standard normal
 distribution, so that the threshold needs no training.
 
 ``c`` is a record of CELL, ``b`` of BANK_STATE.
@@ -17,8 +17,8 @@ from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
 MIN_CHANGE_C = 2e-5
-"""Minimum change of the self-discharge current, as a C-rate [1/h]: 1.4 % a month, less than ``LEAK_STD`` of an intact cell. A hypothesis
-with a smaller estimate starts again."""
+"""Minimum change of the self-discharge current, as a C-rate [1/h]: 1.4 % a month, less than ``LEAK_STD`` of an intact cell. A
+hypothesis with a smaller estimate starts again."""
 MIN_CHANGE_FRACTION = 0.3
 """Minimum change relative to the present self-discharge. Old hypotheses would otherwise hide the end of a short."""
 THRESHOLD_STD = 4.0
@@ -28,7 +28,7 @@ END_STD = 2.0
 MIN_INFORMATION = 1e4
 """Minimum information [h^2]: the change has a std of at most C/100. With less, a single wrong
 innovation would look like a large short."""
-MARGIN = 9.0
+DRAIN_MARGIN = 9.0
 """Minimum excess of the likelihood ratio (twice its logarithm) of a self-discharge over that of a balancer."""
 
 
@@ -97,7 +97,7 @@ def apply_changes(c: Record) -> None:
     elif fall > rise:
         best = FALL
     threshold = END_STD if best == FALL else THRESHOLD_STD
-    if max(rise, fall, drain) < threshold or (best == RISE and rise**2 - drain**2 < MARGIN):
+    if max(rise, fall, drain) < threshold or (best == RISE and rise**2 - drain**2 < DRAIN_MARGIN):
         return
     response, change = c.response[best], c.score[best] / c.information[best]
     for i in range(STATES):

@@ -16,7 +16,7 @@ GATE_V = 0.010
 GATE_STD = 4.0
 """Minimum innovation that may be a fault of the reading, in std."""
 JUMP_FRACTION = 0.5
-"""Minimum deviation of the innovation from its mean over ``JUMP_S``, as a fraction of the innovation, that is a jump."""
+"""Minimum size of a jump: deviation of the innovation from its mean over ``JUMP_S``, as a fraction of the innovation."""
 JUMP_S = 120.0
 """Time constant of the mean innovation before a jump [s]. The voltage of a cell of 20 Ah with a short of 1 ohm drifts by
 about 4 mV in this time, which is less than ``GATE_V``."""
@@ -27,15 +27,15 @@ CONFIRMATION_S = 60.0
 RECOVERY_S = 60.0
 """Duration of correct readings after which a fault has ended [s]."""
 CONTACT_STD = 4.0
-"""Significance of a contact's resistance, in std."""
+"""Minimum significance of a contact's resistance, in std."""
 CONTACT_FRACTION = 0.5
 """Minimum fraction of the squared error that a contact's resistance explains."""
 STUCK_STEP_V = 2e-4
 """Minimum change of a window's mean voltage that counts as a change of the reading [V]."""
 ALIVE_V = 0.002
-"""Minimum change of the other cells' voltage to which a correct reading responds [V]."""
+"""Change of the other cells' voltage to which a correct reading responds [V]."""
 STUCK_V = 0.03
-"""Minimum change of the other cells' voltage without a response that makes a reading stuck [V]."""
+"""A reading is stuck if it does not respond to this change of the other cells' voltage [V]."""
 DRIFT_SOC_STD = 0.1
 """Std of a cell's SOC if its error drifts."""
 DRIFT_LEAK_STD = 0.1
@@ -68,7 +68,7 @@ def is_jump(c: Record, innovation_v: float, variance_v2: float, curve_v: float) 
         c: The cell.
         innovation_v: Innovation [V].
         variance_v2: Variance S of the innovation [V^2].
-        curve_v: Largest error by the shape of the OCV curve [V], which is large near full and empty.
+        curve_v: Largest error due to the curvature of the OCV [V], which is large near full and empty.
     """
     is_large = abs(innovation_v) > max(GATE_V, GATE_STD * math.sqrt(variance_v2), curve_v)
     return is_large and abs(innovation_v - c.innovation_v) > JUMP_FRACTION * abs(innovation_v)
@@ -86,8 +86,7 @@ def examine_reading(
         current_a: Mean current of the window [A].
         elapsed_s: Duration of the window [s].
         noise_v2: Variance of an innovation without the fault [V^2].
-        alive: True if the reading responds to the load. A stuck reading is right by chance when
-            the voltage passes it.
+        alive: True if the reading responds to the load. A stuck reading is right by chance when the voltage passes it.
     """
     decay = math.exp(-elapsed_s / MEMORY_S)
     expected_v = c.offset_v + c.error_ohm * current_a

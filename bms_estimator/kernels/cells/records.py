@@ -72,10 +72,8 @@ BANK_STATE = np.dtype(
     [
         ("started", "i8"),  # 1: a sample was processed
         ("time_s", "f8"),  # time of the last sample [s]
-        (
-            "unseen_s",
-            "f8",
-        ),  # time without samples before the next sample, whose time base may be another one [s]
+        # time without samples before the next sample, which may have another time base [s]
+        ("unseen_s", "f8"),
         ("current_a", "f8"),  # current of the last sample [A]
         ("soc", "f8"),  # SOC of the pack at the last sample
         ("x_ts_a", "f8"),  # current filtered with tau_ts [A]
@@ -83,7 +81,7 @@ BANK_STATE = np.dtype(
         ("windows", "i8"),  # number of windows since the start
         ("samples", "i8"),  # number of samples in the window
         ("elapsed_s", "f8"),  # duration of the window [s]
-        ("change", "f8"),  # change of the SOC in the window by the charge
+        ("change", "f8"),  # change of the SOC in the window by coulomb counting
         ("throughput", "f8"),  # sum of charge and discharge in the window [SOC]
         ("sum_a", "f8"),  # sum of the currents in the window [A]
         ("sum_drop_v", "f8"),  # sum of the overpotentials of one cell in the window [V]

@@ -40,13 +40,13 @@ from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 WINDOW_S = 10.0
-"""Minimum duration of a window [s]. Its means suppress noise, and delays between the readings of current and cells."""
+"""Minimum duration of a window [s]. Its means suppress noise and the delay between the readings of current and cells."""
 MAX_STEP_S = 60.0
 """Maximum time between two samples over which the current counts as measured [s]."""
 NEW_TIME_BASE_S = 1e9
 """Minimum difference between two times that shows another time base [s]: 30 years."""
 NEAR_FULL_SOC = 0.1
-"""After a cell was nearly full, and if the OCV curve is steep there, the cells are not compared until this much charge has flowed in
+"""After a cell was nearly full, and if the OCV curve is steep there, the cells are not compared until this charge has flowed, in
 either direction [SOC]."""
 NEAR_FULL_STD = 0.03
 """Minimum std of a cell's SOC while the cells are not compared."""
@@ -111,16 +111,16 @@ def add_sample(cells: Records, b: Record, p: Record, cells_v: Floats, row: Recor
         dt_s = b.unseen_s
     b.unseen_s = 0.0
     if dt_s > MAX_STEP_S:
-        b.gap, held_a, change = 1, 0.0, row.soc - b.soc
+        b.gap, held_a, change_soc = 1, 0.0, row.soc - b.soc
     else:
         held_a = current_a
-        change = -0.5 * (b.current_a + current_a) * dt_s / p.capacity_as
+        change_soc = -0.5 * (b.current_a + current_a) * dt_s / p.capacity_as
     b.x_ts_a = held_a + (b.x_ts_a - held_a) * math.exp(-dt_s / row.tau_ts_s)
     b.x_tl_a = held_a + (b.x_tl_a - held_a) * math.exp(-dt_s / row.tau_tl_s)
     b.time_s, b.current_a, b.soc = row.time_s, current_a, row.soc
     b.elapsed_s += dt_s
-    b.change += change
-    b.throughput += abs(change)
+    b.change += change_soc
+    b.throughput += abs(change_soc)
     b.sum_a += current_a
     b.sum_drop_v += (row.r_s_ohm * current_a + row.r_ts_ohm * b.x_ts_a + row.r_tl_ohm * b.x_tl_a) / p.series
     b.samples += 1
@@ -137,8 +137,8 @@ def update_cells(
 ) -> None:
     """Update all cells by the means of a window, and begin the next window.
 
-    ``b`` is a record of BANK_STATE, ``p`` of EKF_SETTINGS. ``soc`` and ``soc_std`` are the pack's SOC at the end of the window and its std.
-    ``run_cells`` describes ``cells``, ``balancing_v`` and ``scratch``.
+    ``b`` is a record of BANK_STATE, ``p`` of EKF_SETTINGS. ``soc`` and ``soc_std`` are the pack's SOC at the end of the window
+    and its std. ``run_cells`` describes ``cells``, ``balancing_v`` and ``scratch``.
     """
     m = cells.size
     voltages_v, errors_v, ph = scratch[:m], scratch[m : 2 * m], scratch[2 * m : 2 * m + STATES]
@@ -165,7 +165,7 @@ def update_cells(
         if math.isfinite(voltages_v[i]) and math.isfinite(reference_v):
             slope_v = deviation_and_slope(cells[i], p, soc, drop_v)[1]
             curve_v2 = curve_variance(cells[i], p, soc, soc_std)
-            # an error of the curve remains for CURVE_WINDOWS windows; the factor prevents that averaging reduces it
+            # the factor CURVE_WINDOWS prevents that averaging over as many windows reduces the error of the OCV curve
             variance_v2 = noise_variance(drop_v) + CURVE_WINDOWS * curve_v2 + write_ph(cells[i], slope_v, drop_v, ph)
             innovation_v = errors_v[i] - reference_v
             ignored_v = missed_change_v(cells[i], voltages_v[i], median_v)
@@ -214,10 +214,10 @@ def update_cell(
         c: The cell; updated.
         b: Window, dtype BANK_STATE.
         slope_v: Derivative of the deviation by the cell's SOC [V].
-        drop_v: Overpotential of the reference cell, which is a cell by the model of the pack [V].
+        drop_v: Overpotential of the reference cell [V].
         innovation_v: Innovation [V].
         variance_v2: Variance S of the innovation [V^2].
-        curve_v2: Part of R by the shape of the OCV curve [V^2].
+        curve_v2: Part of R that the curvature of the OCV causes [V^2].
         balancing: True if a balancer may be active.
         near_full: True if the cells are not compared, because one was nearly full.
         current_a: Mean current of the window [A].

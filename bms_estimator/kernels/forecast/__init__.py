@@ -1,1 +1,1 @@
-"""Kernels of the forecast: the cell model run forward under drawn loads."""
+"""Kernels of the forecast: the cell model run forward under randomly drawn loads."""

@@ -14,8 +14,8 @@ from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 PEAK_FRACTION = 0.35
-"""Response of the RC pair of 1 s to a peak shorter than a second, as a fraction of the peak. The mean step response of this pair over
-the first second is 1/e."""
+"""Response of the RC pair of 1 s to a peak shorter than a second, as a fraction of the peak. The mean step response of this
+pair over the first second is 1/e."""
 
 LOAD_BLOCK = np.dtype(
     [
@@ -34,7 +34,7 @@ LOAD_BLOCK = np.dtype(
 
 @njit(cache=True)
 def tabulate_blocks(m: Record, mean_a: Floats, max_a: Floats, block_s: int, blocks: Records) -> None:
-    """Tabulate the observed load, one row for each block of ``block_s`` seconds.
+    """Tabulate the observed load in blocks of ``block_s`` seconds.
 
     Args:
         m: Record of PROJECTED_PACK.
@@ -44,30 +44,29 @@ def tabulate_blocks(m: Record, mean_a: Floats, max_a: Floats, block_s: int, bloc
         blocks: Shape (n,), dtype LOAD_BLOCK; written.
     """
     x, decay, drop = np.empty(BRANCHES), np.exp(-1.0 / TAUS), np.empty(GRID)
-    present_node = round(
-        min(max(m.soc, 0.0), 1.0) * (GRID - 1)
-    )  # the time of the peak is that of the largest drop here
+    # the peak of a block is at its largest drop at the present SOC
+    present_node = round(min(max(m.soc, 0.0), 1.0) * (GRID - 1))
     x[:] = mean_a.mean() - m.offset_a  # the RC currents before the first second are unknown
     for n in range(blocks.shape[0]):
-        row = blocks[n]
-        row.mean_a, row.peak_s, row.mean_x_a[:], row.begin_a[:] = 0.0, 0.0, 0.0, x
-        row.drop_v[:] = -math.inf
+        block = blocks[n]
+        block.mean_a, block.peak_s, block.mean_x_a[:], block.begin_a[:] = 0.0, 0.0, 0.0, x
+        block.drop_v[:] = -math.inf
         for j in range(n * block_s, (n + 1) * block_s):
             current_a, peak_a = mean_a[j] - m.offset_a, max_a[j] - m.offset_a
-            row.mean_a += current_a / block_s
+            block.mean_a += current_a / block_s
             drop[:] = 0.0
             for k in range(BRANCHES):
                 x[k] = current_a + (x[k] - current_a) * decay[k]
-                row.mean_x_a[k] += x[k] / block_s
+                block.mean_x_a[k] += x[k] / block_s
                 x_a = x[k] + (PEAK_FRACTION * (peak_a - current_a) if k == 0 else 0.0)
                 for i in range(GRID):
                     drop[i] += m.ohm[1 + k, i] * x_a
             for i in range(GRID):
                 drop[i] += m.ohm[0, i] * peak_a
-            if drop[present_node] > row.drop_v[present_node]:
-                row.peak_s = j - n * block_s + 1.0
+            if drop[present_node] > block.drop_v[present_node]:
+                block.peak_s = j - n * block_s + 1.0
             for i in range(GRID):
-                row.drop_v[i] = max(row.drop_v[i], drop[i])
-        row.end_a[:] = x
+                block.drop_v[i] = max(block.drop_v[i], drop[i])
+        block.end_a[:] = x
         for k in range(BRANCHES):
-            row.peak_decay[k] = math.exp(-row.peak_s / TAUS[k])
+            block.peak_decay[k] = math.exp(-block.peak_s / TAUS[k])

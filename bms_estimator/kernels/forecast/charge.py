@@ -1,15 +1,15 @@
 """Time until the charger ends the present charge: constant current, then constant voltage down to the tail current.
 
-At constant voltage the current decays about exponentially. Once it does, its measured time constant gives the time. Before that, the
-charge is simulated with the filter's model. In a cell whose OCV has a plateau, the surface of the particles is fuller than their mean during a charge, because
-the charge has to diffuse from the surface. The voltage is that of the surface.
+At constant voltage the current decays about exponentially. Once it does, its measured time constant gives the time. Before that,
+the charge is simulated with the filter's model. In a cell whose OCV has a plateau, the surface of the particles is fuller than
+their mean during a charge, because the charge has to diffuse from the surface. The voltage is that of the surface.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Currents are positive on discharge, so that the charge current is below 0.
 """
 
 import math
 
-from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES, TAUS, TREND
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES, TAUS, TREND_PAIR
 from bms_estimator.kernels.forecast.constant_current import (
     hypothesis_capacity,
     open_circuit_voltage,
@@ -29,10 +29,11 @@ MAX_STEPS = 800
 CURRENT_PAIR = 2
 """Index of the RC pair (30 s) whose filtered current is the present charge current."""
 LEAD_PAIR = 4
-"""Index of the RC pair (500 s) whose filtered current is proportional to the lead: SOC at the surface of the particles minus their mean."""
+"""Index of the RC pair (500 s) whose filtered current is proportional to the lead: SOC at the surface of the particles minus
+their mean."""
 LEAD_S = 180.0
-"""Lead as a charge, per ampere of the filtered current of ``LEAD_PAIR`` [A s / A], in cells whose OCV has a plateau. LFP cells that are
-charged with C/2 to 3.65 V accept another 2 to 3 % at this voltage."""
+"""Lead as a charge, per ampere of the filtered current of ``LEAD_PAIR`` [A s / A], in cells whose OCV has a plateau. LFP cells
+that are charged with C/2 to 3.65 V accept another 2 to 3 % at this voltage."""
 FULL_TOLERANCE = 2e-3
 """Relative distance from the voltage of the constant-voltage phase within which this phase is detected."""
 MAX_DECAY_RATIO = 0.97
@@ -43,16 +44,16 @@ MAX_DECAY_RATIO = 0.97
 def charge_current(s: Record, p: Record) -> float:
     """Return the present charge current [A], below 0; 0 unless the pack has been charged for some minutes.
 
-    Short regeneration does not make the current filtered by RC pair ``TREND`` (120 s) negative.
+    Short regeneration does not make the current filtered by RC pair ``TREND_PAIR`` (120 s) negative.
     """
     max_a = -MIN_CHARGE_C * p.capacity_as / 3600.0
     present_a = s.x_a[CURRENT_PAIR] + s.mean[s.best, X + CURRENT_PAIR]
-    return present_a if max(present_a, s.x_a[TREND] + s.mean[s.best, X + TREND]) < max_a else 0.0
+    return present_a if max(present_a, s.x_a[TREND_PAIR] + s.mean[s.best, X + TREND_PAIR]) < max_a else 0.0
 
 
 @njit(cache=True)
 def time_to_full(s: Record, p: Record, charge_a: float, full_v: float, tail_a: float, scratch: Floats) -> float:
-    """Return the time until the charger ends the charge [s], the weighted mean over the hypotheses; NaN if the charge never ends.
+    """Return the time until the charger ends the charge [s], as a weighted mean over the hypotheses; NaN if it never ends.
 
     Args:
         s: Record of EKF_STATE.
@@ -77,16 +78,17 @@ def time_to_full(s: Record, p: Record, charge_a: float, full_v: float, tail_a: f
 def constant_voltage_time(s: Record, full_v: float, tail_a: float) -> float:
     """Return the time until the constant-voltage phase ends [s]; NaN outside such a phase.
 
-    For a current I e^(-t/tau), the current filtered with tau_k is I e^(-t/tau) / (1 - tau_k/tau). The ratio of two of them gives tau.
+    For a current I e^(-t/tau), the current filtered with tau_k is I e^(-t/tau) / (1 - tau_k/tau). The ratio of two filtered
+    currents gives tau.
 
     Args:
         s: Record of EKF_STATE.
         full_v: Voltage of the constant-voltage phase [V].
         tail_a: Charge current that ends this phase [A], above 0.
     """
-    short_s, long_s = TAUS[CURRENT_PAIR], TAUS[TREND]
+    short_s, long_s = TAUS[CURRENT_PAIR], TAUS[TREND_PAIR]
     short_a = -s.x_a[CURRENT_PAIR] - s.mean[s.best, X + CURRENT_PAIR]
-    long_a = -s.x_a[TREND] - s.mean[s.best, X + TREND]
+    long_a = -s.x_a[TREND_PAIR] - s.mean[s.best, X + TREND_PAIR]
     measured_v = s.voltage_v + s.innovation_v
     if measured_v < (1.0 - FULL_TOLERANCE) * full_v or not 0.0 < short_a < MAX_DECAY_RATIO * long_a or tail_a <= 0.0:
         return math.nan
@@ -151,7 +153,7 @@ def constant_voltage_current(
         ohm: Scratch space of shape (RESISTANCES,).
     """
     capacity_as = hypothesis_capacity(s, p, q)
-    # an OCV without a plateau and the curves of a fit need no lead
+    # without a plateau, and after a fit of the curve, the settings contain the correlation NODE_CORRELATION, and no lead applies
     lead_s = LEAD_S if p.node_correlation > NODE_CORRELATION else 0.0
     lead_decay = math.exp(-dt_s / TAUS[LEAD_PAIR])
     surface_soc = soc - lead_s * lead_decay * x[LEAD_PAIR] / capacity_as

@@ -3,8 +3,8 @@
     v(t) = E_o(z, T) + M h + c e - e^s0 R_0 i - e^s sum R_k x_k + b_slow + b_fast
 
 M h is the hysteresis, c e the error of the OCV curve, and b the biases. e^s0 and e^s are the factors on the resistances.
-The response of the RC pairs is exact: x_k(t) = i + (x_k(0) - i) e^(-t / tau_k). OCV and resistances are those of the SOC after the
-charge i t. The biases decay with their time constants. The temperature is constant.
+The response of the RC pairs is exact: x_k(t) = i + (x_k(0) - i) e^(-t / tau_k). OCV and resistances are those at the SOC after
+the charge i t. The biases decay with their time constants. The temperature is constant.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS, and ``q`` the index of a hypothesis. Currents are positive on discharge.
 """
@@ -31,7 +31,7 @@ from bms_estimator.numba_cache import njit
 
 @njit(cache=True)
 def hypothesis_capacity(s: Record, p: Record, q: int) -> float:
-    """Return the capacity [A s]."""
+    """Return the capacity of hypothesis ``q`` [A s]."""
     return p.capacity_as * math.exp(s.mean[q, LN_Q])
 
 

@@ -59,10 +59,10 @@ def draw_pack(d: Record, m: Record, generator: np.uint64) -> None:
     generator, voltage_stds = normal(generator)
     generator, resistance_stds = normal(generator)
     generator, weakest_stds = normal(generator)
-    weakest = m.weakest_std * max(weakest_stds, 0.0)  # the weakest cell is never better than the mean
+    imbalance = m.weakest_std * max(weakest_stds, 0.0)  # the weakest cell is never better than the mean
     d.begin_soc = m.soc - m.surface_soc + m.soc_std * soc_stds
-    d.begin_soc -= weakest * max(1.0 - d.begin_soc, 0.0)
-    d.capacity_as = m.capacity_as * math.exp(m.capacity_std * capacity_stds) / (1.0 + weakest)
+    d.begin_soc -= imbalance * max(1.0 - d.begin_soc, 0.0)
+    d.capacity_as = m.capacity_as * math.exp(m.capacity_std * capacity_stds) / (1.0 + imbalance)
     d.load_factor = 1.0
     d.voltage_error_v = m.voltage_std_v * voltage_stds
     d.resistance_factor = m.resistance_mean + m.resistance_std * resistance_stds

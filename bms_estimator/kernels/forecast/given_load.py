@@ -1,4 +1,4 @@
-"""Simulation of draws under a given load: parts with a constant current or power."""
+"""Simulation of draws under a load that the caller gives as parts with a constant current or power."""
 
 import math
 

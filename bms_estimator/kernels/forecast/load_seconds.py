@@ -9,15 +9,16 @@ import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import TAU_S
 from bms_estimator.kernels.kalman_filter.current_offset import REST_C
-from bms_estimator.kernels.kalman_filter.ekf import CHARGE, CHARGE_C
+from bms_estimator.kernels.kalman_filter.ekf import CHARGE_C, CHARGE_PAIR
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 MAX_LOAD_S = 20_000
 """Capacity of the ring buffer [s]: about 5.5 hours of use, in 160 kB."""
 MAX_STORED_REST_S = 4000
-"""Maximum length of a rest in the ring buffer [s]. Later seconds of the rest are not stored, because they would displace the load before it."""
-CHARGE_WEIGHT = 1.0 - math.exp(-1.0 / TAU_S[CHARGE])
+"""Maximum length of a rest in the ring buffer [s]. Later seconds of the rest are not stored, because they would displace the
+load before the rest."""
+CHARGE_WEIGHT = 1.0 - math.exp(-1.0 / TAU_S[CHARGE_PAIR])
 """Weight of a new second in the filtered current that distinguishes a charge from regeneration."""
 
 LOAD = np.dtype(
@@ -28,7 +29,7 @@ LOAD = np.dtype(
         ("part_s", "f8"),  # elapsed part of the present second [s]
         ("part_as", "f8"),  # charge of the present second until now [A s]
         ("part_max_a", "f8"),  # largest current of the present second until now [A]
-        ("filtered_a", "f8"),  # current, filtered with the time constant ``TAU_S[CHARGE]`` [A]
+        ("filtered_a", "f8"),  # current, filtered with the time constant ``TAU_S[CHARGE_PAIR]`` [A]
         ("last_a", "f8"),  # mean current of the last complete second [A]
         ("rest_s", "i8"),  # duration of the present rest [s]
         ("seen_discharge_a", "f8"),  # largest mean current of a second so far [A], at least 0
@@ -75,13 +76,15 @@ def begin_second(load: Record) -> None:
 def add_step(load: Record, step_s: float, mean_a: float, end_a: float, one_c_a: float) -> None:
     """Divide a step between two rows among the seconds that it spans.
 
-    The mean current counts for the mean and the largest current of all of them. The current at the end of the step, ``end_a``
-    [A], also counts for the largest current of the second that contains it.
+    All these seconds receive the mean current of the step, for their mean and for their largest current. The second that
+    contains the end of the step also receives ``end_a`` [A] for its largest current.
     """
     while load.part_s + step_s >= 1.0:
         part_s = 1.0 - load.part_s
         step_s -= part_s
-        largest_a = max(load.part_max_a, mean_a, end_a if step_s <= 0.0 else mean_a)  # below 0 by rounding
+        largest_a = max(
+            load.part_max_a, mean_a, end_a if step_s <= 0.0 else mean_a
+        )  # rounding may make step_s negative
         add_second(load, load.part_as + mean_a * part_s, largest_a, one_c_a)
         begin_second(load)
     if step_s > 0.0:

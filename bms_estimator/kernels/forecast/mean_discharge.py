@@ -82,7 +82,7 @@ def draw_without_errors(d: Record, m: Record) -> None:
 def mean_and_peak_voltage(
     m: Record, d: Record, mean_a: float, peak_a: float, variance_a2: float, soc: float
 ) -> tuple[float, float]:
-    """Return the energy per charge and the voltage at a peak [V], at ``soc`` after the mean current down to there.
+    """Return the energy per charge and the voltage at a peak [V], after a discharge to ``soc`` with the mean current.
 
     Args:
         m: Record of PROJECTED_PACK.

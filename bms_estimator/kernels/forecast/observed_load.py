@@ -16,7 +16,7 @@ from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 
 MEAN_RUN_S = 300.0
-"""Mean time between two jumps of a draw [s]: the scale over which the order of the observed load is kept."""
+"""Mean time between two jumps of a draw [s]. The order of the observed load is preserved on this time scale."""
 
 NEGLIGIBLE_DIFFERENCE_C = 1e-3
 """Difference of an RC current below which it counts as zero, as a C-rate."""
@@ -78,27 +78,27 @@ def simulate_draw(
     begin_load(m, blocks, block_s, d)
     soc, d.ended, step = d.begin_soc, 0, 0
     while step < steps:
-        row = blocks[d.block]
-        moved = d.load_factor * row.mean_a * block_s / d.capacity_as
-        middle = min(soc - 0.5 * moved, 1.0)
-        i, t = grid_position(middle)
-        difference_v = difference_drop(m, d, row, i, t)
-        drop_v = d.load_factor * (row.drop_v[i] + t * (row.drop_v[i + 1] - row.drop_v[i])) + difference_v
-        if loaded_voltage(d, m, middle, drop_v) <= m.cutoff_v:
+        block = blocks[d.block]
+        drawn_soc = d.load_factor * block.mean_a * block_s / d.capacity_as
+        middle_soc = min(soc - 0.5 * drawn_soc, 1.0)
+        i, t = grid_position(middle_soc)
+        difference_v = difference_drop(m, d, block, i, t)
+        drop_v = d.load_factor * (block.drop_v[i] + t * (block.drop_v[i + 1] - block.drop_v[i])) + difference_v
+        if loaded_voltage(d, m, middle_soc, drop_v) <= m.cutoff_v:
             d.ended = 1
             break
         if stride > 0 and step % stride == 0:
-            mean_drop_v = d.load_factor * mean_drop(m, row, i, t) + difference_v
-            soc_points[step // stride] = middle
-            voltage_points_v[step // stride] = loaded_voltage(d, m, middle, mean_drop_v)
-        soc = min(soc - moved, 1.0)
+            mean_drop_v = d.load_factor * mean_drop(m, block, i, t) + difference_v
+            soc_points[step // stride] = middle_soc
+            voltage_points_v[step // stride] = loaded_voltage(d, m, middle_soc, mean_drop_v)
+        soc = min(soc - drawn_soc, 1.0)
         step += 1
         advance_load(blocks, block_s, decay, d)
     d.time_s, d.soc = step * block_s, soc
     if d.ended:
-        row = blocks[d.block]
-        d.time_s += row.peak_s
-        d.soc -= d.load_factor * row.mean_a * row.peak_s / d.capacity_as
+        block = blocks[d.block]
+        d.time_s += block.peak_s
+        d.soc -= d.load_factor * block.mean_a * block.peak_s / d.capacity_as
     if stride > 0:
         for point in range((step + stride - 1) // stride, soc_points.size):
             soc_points[point], voltage_points_v[point] = d.soc, m.cutoff_v
@@ -115,7 +115,7 @@ def begin_load(m: Record, blocks: Records, block_s: float, d: Record) -> None:
 
 @njit(cache=True)
 def advance_load(blocks: Records, block_s: float, decay: Floats, d: Record) -> None:
-    """Set the next block of a draw, and the differences of its RC currents from the tabulated ones at the beginning of this block."""
+    """Set the next block of a draw, and the differences of its RC currents from those at the beginning of the tabulated block."""
     negligible_a = NEGLIGIBLE_DIFFERENCE_C * d.capacity_as / 3600.0
     for k in range(d.first_pair, BRANCHES):
         d.difference_a[k] *= decay[k]
@@ -144,7 +144,7 @@ def jump(blocks: Records, block_s: float, d: Record) -> None:
 
 
 @njit(cache=True)
-def difference_drop(m: Record, d: Record, row: Record, i: int, t: float) -> float:
+def difference_drop(m: Record, d: Record, block: Record, i: int, t: float) -> float:
     """Return the voltage drop that the differences of the RC currents cause at the peak of a block [V].
 
     ``i`` and ``t`` are a position in the SOC grid (``grid_position``).
@@ -152,14 +152,14 @@ def difference_drop(m: Record, d: Record, row: Record, i: int, t: float) -> floa
     drop_v = 0.0
     for k in range(d.first_pair, BRANCHES):
         r_ohm = m.ohm[1 + k, i] + t * (m.ohm[1 + k, i + 1] - m.ohm[1 + k, i])
-        drop_v += r_ohm * d.difference_a[k] * row.peak_decay[k]
+        drop_v += r_ohm * d.difference_a[k] * block.peak_decay[k]
     return drop_v
 
 
 @njit(cache=True)
-def mean_drop(m: Record, row: Record, i: int, t: float) -> float:
+def mean_drop(m: Record, block: Record, i: int, t: float) -> float:
     """Return the mean voltage drop of a block with its tabulated RC currents, at a position in the SOC grid [V]."""
-    drop_v = (m.ohm[0, i] + t * (m.ohm[0, i + 1] - m.ohm[0, i])) * row.mean_a
+    drop_v = (m.ohm[0, i] + t * (m.ohm[0, i + 1] - m.ohm[0, i])) * block.mean_a
     for k in range(BRANCHES):
-        drop_v += (m.ohm[1 + k, i] + t * (m.ohm[1 + k, i + 1] - m.ohm[1 + k, i])) * row.mean_x_a[k]
+        drop_v += (m.ohm[1 + k, i] + t * (m.ohm[1 + k, i + 1] - m.ohm[1 + k, i])) * block.mean_x_a[k]
     return drop_v

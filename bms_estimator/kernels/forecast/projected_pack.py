@@ -27,14 +27,14 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 SOC_STD_FACTOR = 0.5
-"""Factor on the filter's std of the SOC in the draws. The full std would count twice the error that SOC and biases share."""
+"""Factor on the filter's std of the SOC in the draws. With the full std, an error that SOC and biases share would count twice."""
 MIN_SOC_STD = 0.02
 """Minimum std of the SOC, added in quadrature to that of the filter [SOC]."""
 CAPACITY_STD_FACTOR = 0.5
 """Factor on the filter's std of the capacity in the draws."""
 VOLTAGE_STD_V = 0.02
 """Std of the voltage error of one cell's model at 25 C, constant until the cut-off [V]."""
-VOLTAGE_STD_J = 22e3
+VOLTAGE_ERROR_ENERGY = 22e3
 """Activation energy of the variance of the voltage error [J/mol]."""
 RESISTANCE_MEAN = 1.05
 """Mean factor on the voltage drop of the present model."""
@@ -43,15 +43,15 @@ RESISTANCE_STD = 0.05
 GROWTH_SOC = 0.4
 """SOC below which the fast resistances R_0 and R_1 grow beyond those of the cell file."""
 GROWTH = 0.75
-"""Relative growth of the fast resistances from ``GROWTH_SOC`` to SOC 0, beyond that of the cell file, at 25 C. Few captures for cell
-files contain large currents near empty. The growth increases with the Arrhenius factor of ``LOW_ACTIVATION_ENERGY`` in the cold. Without growth, or
-with growth of all resistances, the forecasts of real captures are worse (docs/theory/forecast.md)."""
+"""Relative growth of the fast resistances from ``GROWTH_SOC`` to SOC 0, beyond that of the cell file, at 25 C. Few captures for
+cell files contain large currents near empty. The growth increases with the Arrhenius factor of ``LOW_ACTIVATION_ENERGY`` in the
+cold. Without growth, or with growth of all resistances, the forecasts of real captures are worse (docs/theory/forecast.md)."""
 FAST_RESISTANCES = 2
 """Number of fast resistances: R_0 and R_1. They decide the voltage at the peaks of a load, at which discharges end."""
 SURFACE_S = 15.0
 """Charge by which the surface of the particles is emptier than their mean, per ampere of the peak current [A s / A], at 25 C.
-Diffusion in the particles needs this gradient. The voltage is that of the surface, so that the knee near empty comes earlier under
-large currents. The gradient increases with the Arrhenius factor of ``LOW_ACTIVATION_ENERGY`` in the cold."""
+Diffusion in the particles needs this gradient. The voltage is that of the surface, so that the knee near empty comes earlier
+under large currents. The gradient increases with the Arrhenius factor of ``LOW_ACTIVATION_ENERGY`` in the cold."""
 
 PROJECTED_PACK = np.dtype(
     [
@@ -97,7 +97,7 @@ def project_pack(m: Record, s: Record, p: Record, cutoff_v: float, peak_a: float
     m.soc_std = math.sqrt((SOC_STD_FACTOR * s.soc_std) ** 2 + MIN_SOC_STD**2)
     m.weakest_std = p.cell_spread if p.series > 1.0 else 0.0
     m.capacity_std = CAPACITY_STD_FACTOR * math.sqrt(cov[LN_Q, LN_Q])
-    m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_STD_J, s.temperature_c))
+    m.voltage_std_v = VOLTAGE_STD_V * p.series * math.sqrt(arrhenius(VOLTAGE_ERROR_ENERGY, s.temperature_c))
     m.resistance_mean, m.resistance_std = RESISTANCE_MEAN, RESISTANCE_STD
     m.surface_soc = SURFACE_S * max(s.weak, 1.0) * max(peak_a, s.mean_a, 0.0) / m.capacity_as
     project_voltage(m, s, p)
@@ -136,7 +136,7 @@ def project_resistances(m: Record, s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def growth_factor(s: Record, from_soc: float, to_soc: float) -> float:
-    """Return the factor by which the fast resistances grow beyond those of the cell file from one SOC to another, at least 1.
+    """Return the growth of the fast resistances beyond that of the cell file between two SOCs, as a factor of at least 1.
 
     The filter's factors on the resistances already contain the growth down to the present SOC.
     """

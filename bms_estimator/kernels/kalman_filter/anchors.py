@@ -3,7 +3,7 @@
 Full: the voltage was at the full voltage for 15 s while the charge current was small, and the charge then ended. A
 charge that ends at the full voltage with a large current is not full: its voltage includes the overpotential of that
 current. Chargers without a constant-voltage phase and a protection that reacts to one high cell end charges in this way.
-The std of this anchor contains what voltage, overpotential and diffusion hide.
+The std of this anchor includes the SOC that is missing because of a low voltage, the overpotential and diffusion.
 The end of the charge is required, because a slow charge at constant current reaches the lower limit of the full voltage up to
 2.5 % of SOC too early. If the charger does not switch off, the pack is full after an hour at the full voltage with less than
 the tail current.
@@ -25,7 +25,7 @@ import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, resistances
-from bms_estimator.kernels.kalman_filter.ekf import CHARGE, HOLD_CELL, HOLD_OFFSET, apply_correction
+from bms_estimator.kernels.kalman_filter.ekf import CHARGE_PAIR, HOLD_CELL, HOLD_OFFSET, apply_correction
 from bms_estimator.kernels.kalman_filter.mixture import (
     clear_hypothesis,
     copy_hypothesis,
@@ -44,13 +44,13 @@ FULL_STD = 0.01
 """Minimum std of the SOC when full. The end of charge of one charger at one pack repeats within about 1 %."""
 LEAD_SOC = 0.05
 """Part of the std of the SOC when full that is caused by diffusion, per C-rate of the charge. The surfaces of the particles are
-full before their interiors: after a charge with C/2 to 3.65 V, LFP cells take in another 2 to 3 % at this voltage."""
+full before their interiors: after a charge with C/2 to 3.65 V, LFP cells accept another 2 to 3 % at this voltage."""
 AT_FULL_S = 15.0
-"""Minimum time at the full voltage with a small charge current [s]. A fast charger takes 20 s from C/8 to C/20 in an LFP
-cell. Regeneration is mostly shorter."""
+"""Minimum time at the full voltage with a small charge current [s]. With a fast charger, the current of an LFP cell falls from
+C/8 to C/20 in 20 s. Regeneration is mostly shorter."""
 MAX_AT_FULL_S = 2.0 * AT_FULL_S
-"""Limit of the counted time after voltage or current has left its range [s]. From then on the time counts down, and the end of
-the charge counts as full for at most another 15 s."""
+"""Limit of the counted time once voltage or current has left its range [s]. The time then counts down, so that a charge which
+ends within another 15 s still counts as full."""
 FLOAT_S = 3600.0
 """Time at the full voltage after which a charge below the tail current counts as ended [s], because some chargers do not switch
 off."""
@@ -59,8 +59,7 @@ MAX_COUNTED_S = 0.5 * AT_FULL_S
 MAX_CHARGE_GAP_S = 1800.0
 """Maximum gap in the constant-voltage phase of a charge [s]. Assumed."""
 REARM_SOC = 0.02
-"""Minimum charge between two anchors of one kind [SOC]. A charger that trickles for days must not cause an anchor again and
-again."""
+"""Minimum charge between two anchors of one kind [SOC]. A charger that trickles for days must not cause repeated anchors."""
 DISCONNECTED_S = 60.0
 """Time without current after which a protection has ended the discharge [s]. Stops of a vehicle are mostly shorter."""
 IDLE_C = 0.02
@@ -69,7 +68,7 @@ MAX_EMPTY_STD = 0.05
 """Maximum std of the SOC when empty. It is exceeded below about 10 C, where cells reach the cut-off voltage at a higher SOC than
 this std describes."""
 MAX_STDS = 3.0
-"""Maximum difference of the SOCs of anchor and filter, in std of the difference. If it is larger, the filter's biases have
+"""Maximum difference between the SOCs of anchor and filter, in std of the difference. Beyond it, the filter's biases have
 absorbed a wrong SOC."""
 
 ANCHOR_SETTINGS = np.dtype(
@@ -114,8 +113,8 @@ def continue_over_gap(
 ) -> None:
     """Count a charge at the full voltage with a small current at the first sample after a gap, and discard everything else.
 
-    A sparse log has samples some minutes apart in the constant-voltage phase. A pack in this phase before and after the gap was in
-    it all the time.
+    A sparse log has samples some minutes apart in the constant-voltage phase. A pack in this phase before and after the gap was
+    in it throughout.
     """
     at_full_s = a.at_full_s if gap_s <= MAX_CHARGE_GAP_S else 0.0
     a.at_full_s = a.idle_s = 0.0
@@ -180,7 +179,7 @@ def charge_ends_full(
 def is_charging_at_full(p: Record, f: Record, current_a: float, voltage_v: float) -> bool:
     """Return True during a charge at the full voltage with a small current."""
     is_small = -p.small_a <= current_a <= -p.trickle_a
-    is_charge = f.x_a[CHARGE] <= -p.trickle_a  # averaged over 500 s, which is longer than regeneration
+    is_charge = f.x_a[CHARGE_PAIR] <= -p.trickle_a  # averaged over 500 s, which is longer than regeneration
     return voltage_v >= p.full_v and is_small and is_charge
 
 
@@ -217,14 +216,13 @@ def gap_begins_empty(a: Record, gap_s: float) -> bool:
 def full_std(f: Record, ekf: Record, current_a: float, below_v: float) -> float:
     """Return the std of the SOC at the end of a charge with ``current_a`` [A], ``below_v`` below the charger's voltage [V].
 
-    It consists of ``FULL_STD``, of the SOC that is missing to 1 because the voltage is too low and contains the overpotential of
-    the current, and of the SOC by which diffusion delays the particles' interiors. The missing SOC is not subtracted, because the
-    charge that defined SOC 1 of the cell file may have ended at another current than the owner's, and the source may report too low
-    a voltage.
+    It consists of ``FULL_STD``, of the SOC that is missing to 1 according to the voltage without the overpotential, and of the
+    SOC by which the particles' interiors lag behind. The missing SOC is not subtracted. The charge that defined SOC 1 of the cell
+    file may have ended at another current, or the source may report too low a voltage.
     """
     open_v = ocv(1.0, ekf.ocv_v, ekf.ocv_slope_v) - below_v + overpotential(f, ekf, 1.0, current_a)
     missing_soc = 1.0 - soc_from_ocv(open_v, ekf.ocv_v, ekf.ocv_slope_v)
-    lead_soc = LEAD_SOC * f.weak * f.x_a[CHARGE] * 3600.0 / ekf.capacity_as
+    lead_soc = LEAD_SOC * f.weak * f.x_a[CHARGE_PAIR] * 3600.0 / ekf.capacity_as
     return math.sqrt(FULL_STD**2 + missing_soc**2 + lead_soc**2)
 
 
@@ -242,7 +240,7 @@ def empty_std(f: Record, ekf: Record, current_a: float, cutoff_v: float) -> floa
 
 @njit(cache=True)
 def overpotential(f: Record, ekf: Record, soc: float, current_a: float) -> float:
-    """Return the overpotential of the likeliest hypothesis with the resistances at ``soc``, positive on discharge [V]."""
+    """Return the overpotential of the most likely hypothesis with the resistances at ``soc``, positive on discharge [V]."""
     x, ohm = f.mean[f.best], f.ohm
     resistances(soc, ekf.weak_ohm, ekf.strong_ohm, f.weak, f.strong, ohm)
     pairs_v = 0.0
@@ -284,7 +282,7 @@ def apply_prior(f: Record, soc: float, std: float) -> None:
 
 @njit(cache=True)
 def choose_best(f: Record) -> None:
-    """Choose the likeliest hypothesis again after a correction of the weights, and merge and remove hypotheses."""
+    """Choose the most likely hypothesis after a correction of the weights, and merge and remove hypotheses."""
     for q in range(f.count):
         if f.ln_weight[q] > f.ln_weight[f.best]:
             f.best = q
@@ -304,7 +302,7 @@ def update_by_anchor(f: Record, q: int, soc: float, variance: float) -> None:
 
 @njit(cache=True)
 def restart_at_anchor(f: Record, ekf: Record, soc: float, variance: float) -> None:
-    """Restart the likeliest hypothesis at an SOC, without the biases and the CURVE error that have absorbed a wrong SOC.
+    """Restart the most likely hypothesis at an SOC, without the biases and the CURVE error that have absorbed a wrong SOC.
 
     Capacity, offset, OCV nodes, resistances and polarization do not change.
     """

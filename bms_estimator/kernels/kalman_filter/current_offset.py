@@ -53,8 +53,8 @@ def update_offset_at_rest(s: Record, p: Record) -> None:
     if s.smallest_a == 0.0 or abs(half_a) > 0.5 * ZERO_C * one_c:
         return
     hidden_a = max(s.smallest_a, p.current_step_a, p.dead_band_a)
-    information_a2 = (p.zero_std_c * one_c) ** 2 + hidden_a * hidden_a / 3.0 + half_a * half_a
+    measured_a2 = (p.zero_std_c * one_c) ** 2 + hidden_a * hidden_a / 3.0 + half_a * half_a
     for q in range(s.count):
         offset_a2 = s.covariance[q, OFFSET, OFFSET]
-        if offset_a2 > MIN_VARIANCE_RATIO * information_a2:
-            update_state_directly(s, p, q, OFFSET, half_a, offset_a2 * information_a2 / (offset_a2 - information_a2))
+        if offset_a2 > MIN_VARIANCE_RATIO * measured_a2:
+            update_state_directly(s, p, q, OFFSET, half_a, offset_a2 * measured_a2 / (offset_a2 - measured_a2))

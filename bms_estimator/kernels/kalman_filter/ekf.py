@@ -7,7 +7,7 @@ read a clock.
 import math
 
 from bms_estimator.kernels.cell_model.chen_mora import ocv
-from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, REFERENCE_C, TAUS, TREND, on_grid, resistances
+from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, REFERENCE_C, TAUS, TREND_PAIR, on_grid, resistances
 from bms_estimator.kernels.kalman_filter.noise import add_process_noise, bias_variance, resistance_std
 from bms_estimator.kernels.kalman_filter.ocv_correction import node_error_scale, node_position, ocv_correction
 from bms_estimator.kernels.kalman_filter.records import (
@@ -72,7 +72,7 @@ LEARNING_C = 0.4
 C-rate."""
 NEARLY_FULL_SOC = 0.9
 """SOC above which ``NEARLY_FULL_C`` limits the current instead of ``LEARNING_C``."""
-CHARGE = TREND + 1
+CHARGE_PAIR = TREND_PAIR + 1
 """Index of the RC pair of 500 s, whose filtered current distinguishes a charge from regeneration."""
 CHARGE_C = 0.04
 """Minimum filtered current of a charge, as a C-rate. Regeneration is shorter and has a smaller one."""
@@ -102,7 +102,7 @@ def hysteresis_charge(s: Record, p: Record) -> float:
     It is computed with the trend of the current, because short regeneration does not reverse the hysteresis.
     """
     w = s.window
-    return w.charge_as if w.gap and w.time_s > p.unmeasured_s else s.x_a[TREND] * w.time_s
+    return w.charge_as if w.gap and w.time_s > p.unmeasured_s else s.x_a[TREND_PAIR] * w.time_s
 
 
 @njit(cache=True)
@@ -114,7 +114,7 @@ def predict(s: Record, p: Record, q: int) -> None:
     x, cov, f, w = s.mean[q], s.covariance[q], s.f, s.window
     bias_v2 = bias_variance(s, p, q)
     capacity_as = p.capacity_as * math.exp(x[LN_Q])
-    moved = (w.charge_as - x[OFFSET] * w.time_s) / capacity_as
+    drawn_soc = (w.charge_as - x[OFFSET] * w.time_s) / capacity_as
     f[CURVE] = math.exp(-w.throughput_as / p.capacity_as / on_grid(x[SOC], p.curve_soc))
     for j in range(NODE):  # F is 1 for the nodes
         x[j] *= f[j]
@@ -122,23 +122,23 @@ def predict(s: Record, p: Record, q: int) -> None:
         factor, row = f[j], cov[j]
         for k in range(STATES if j < NODE else NODE):
             row[k] *= factor * f[k]
-    x[SOC] -= moved  # (2.1) of the thesis
+    x[SOC] -= drawn_soc  # (2.1) of the thesis
     x[HYST] -= math.copysign(1.0 - f[HYST], hysteresis_charge(s, p))
     for k in range(X, X + BRANCHES):
         x[k] -= (1.0 - f[k]) * x[OFFSET]
-    apply_offdiagonal_transition(cov, f, w.time_s / capacity_as, moved)
+    apply_offdiagonal_transition(cov, f, w.time_s / capacity_as, drawn_soc)
     add_process_noise(s, p, q, w.throughput_as / capacity_as, bias_v2)
 
 
 @njit(cache=True)
-def apply_offdiagonal_transition(cov: Floats, f: Floats, by_offset: float, moved: float) -> None:
-    """Apply the off-diagonal elements of F: SOC by offset [1/A] and by ln Q, RC pairs by offset."""
+def apply_offdiagonal_transition(cov: Floats, f: Floats, by_offset: float, by_ln_q: float) -> None:
+    """Apply the off-diagonal elements of F: derivatives of the SOC by offset [1/A] and by ln Q, and of the RC pairs by offset."""
     for k in range(STATES):
-        cov[SOC, k] += by_offset * cov[OFFSET, k] + moved * cov[LN_Q, k]
+        cov[SOC, k] += by_offset * cov[OFFSET, k] + by_ln_q * cov[LN_Q, k]
         for j in range(X, X + BRANCHES):
             cov[j, k] -= (1.0 - f[j]) * cov[OFFSET, k]
     for k in range(STATES):
-        cov[k, SOC] += by_offset * cov[k, OFFSET] + moved * cov[k, LN_Q]
+        cov[k, SOC] += by_offset * cov[k, OFFSET] + by_ln_q * cov[k, LN_Q]
         for j in range(X, X + BRANCHES):
             cov[k, j] -= (1.0 - f[j]) * cov[k, OFFSET]
     for j in range(SOC, X + BRANCHES):  # rounding makes the rows and columns differ
@@ -267,19 +267,19 @@ def update_state_directly(s: Record, p: Record, q: int, j: int, value: float, va
 def states_to_hold(s: Record, p: Record, q: int) -> int:
     """Return the set of states that a voltage must not change.
 
-    An SOC outside 0..1 is limited, so that a voltage error there gives no information on sensor, capacity and curve. If
+    An SOC outside 0..1 is clipped, so that a voltage error there gives no information on sensor, capacity and curve. If the
     resistances are uncertain, resistance and capacity have equal effects on the voltage under a large constant current
     and in a constant-voltage charge. The capacity is then updated at rest, at small currents and in a varying discharge.
     """
     soc, one_c = s.mean[q, SOC], p.capacity_as / 3600.0
     if not 0.0 <= soc <= 1.0:
-        is_charge = s.x_a[CHARGE] < -CHARGE_C * one_c
+        is_charge = s.x_a[CHARGE_PAIR] < -CHARGE_C * one_c
         return HOLD_CELL | HOLD_OFFSET | (HOLD_CURVE if is_charge else 0)
     if p.r_std <= INDEPENDENT_R_STD:
         return cell_to_hold(s, p)
     small_a = NEARLY_FULL_C * one_c if soc > NEARLY_FULL_SOC else LEARNING_C * one_c
-    varying = s.x_a[TREND] > 0.0 and s.rms_a2 - s.mean_a * s.mean_a > (VARYING_C * one_c) ** 2
-    capacity_is_visible = abs(s.x_a[TREND]) < small_a or varying
+    varying = s.x_a[TREND_PAIR] > 0.0 and s.rms_a2 - s.mean_a * s.mean_a > (VARYING_C * one_c) ** 2
+    capacity_is_visible = abs(s.x_a[TREND_PAIR]) < small_a or varying
     return cell_to_hold(s, p) | (0 if capacity_is_visible else HOLD_CAPACITY)
 
 

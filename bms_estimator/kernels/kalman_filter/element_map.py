@@ -58,11 +58,7 @@ ELEMENT_FIT = np.dtype(
     [
         ("a", "f8", PARAMETERS),  # a1..a15 at their own index
         ("std", "f8", PARAMETERS),  # standard errors, NaN without data
-        (
-            "delta_std",
-            "f8",
-            ELEMENTS,
-        ),  # standard error of ``delta`` of the element, (2.11) and (2.12); NaN without data
+        ("delta_std", "f8", ELEMENTS),  # standard errors of ``delta``, (2.11) and (2.12); NaN without data
         ("bins", "i8", ELEMENTS),  # number of bins with data of the element
         ("soc", "f8", BINS),  # data of the last fit: SOC
         ("value", "f8", BINS),  # data of the last fit: element at ``soc``

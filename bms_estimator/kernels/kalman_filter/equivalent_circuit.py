@@ -29,7 +29,7 @@ R_S, R_TS, TAU_TS, C_TS, R_TL, TAU_TL, C_TL = range(7)
 """Indices of the circuit elements in ``value`` and ``ln_variance`` of a record of EQUIVALENT."""
 SHORT_S = 60.0
 """Limit between the time constants published as R_ts C_ts and as R_tl C_tl [s]."""
-SHORT = sum(tau_s < SHORT_S for tau_s in TAU_S)
+SHORT_PAIRS = sum(tau_s < SHORT_S for tau_s in TAU_S)
 """Number of the ladder's RC pairs that belong to R_ts."""
 SHAPE_STD = 0.03
 """Relative std of the cell file's series resistance over SOC and temperature after multiplication by one scale factor."""
@@ -53,7 +53,7 @@ EQUIVALENT = np.dtype(
 
 @njit(cache=True)
 def write_equivalent_circuit(f: Record, p: Record, e: Record) -> None:
-    """Write the resistances and two RC pairs at SOC and temperature of the likeliest hypothesis to ``e``."""
+    """Write the resistances and two RC pairs at SOC and temperature of the most likely hypothesis to ``e``."""
     x, cov = f.mean[f.best], f.covariance[f.best]
     # each resistance is the sum of a part with weak and a part with strong temperature dependence
     resistances(x[SOC], p.weak_ohm, p.strong_ohm, f.weak, f.strong, e.ohm)
@@ -66,8 +66,8 @@ def write_equivalent_circuit(f: Record, p: Record, e: Record) -> None:
     half_ohm = 0.5 * branch_rise_within_sample(f, e)
     e.value[R_S] = file_r_0_ohm * math.exp(ln_ratio) + half_ohm
     e.ln_variance[R_S] = variance + (half_ohm / e.value[R_S]) ** 2
-    write_rc_pair(e, 0, SHORT, R_TS, cov[LN_R, LN_R], p.r_std)
-    write_rc_pair(e, SHORT, BRANCHES, R_TL, cov[LN_R, LN_R], p.r_std)
+    write_rc_pair(e, 0, SHORT_PAIRS, R_TS, cov[LN_R, LN_R], p.r_std)
+    write_rc_pair(e, SHORT_PAIRS, BRANCHES, R_TL, cov[LN_R, LN_R], p.r_std)
 
 
 @njit(cache=True)

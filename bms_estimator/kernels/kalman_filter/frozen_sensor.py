@@ -1,8 +1,8 @@
 """Detection of a frozen voltage or current: a constant value that charge or load contradict.
 
-A loose wire or a hanging converter causes such values. In CHECKS, ``held_*`` are values at or since the last change of the
-voltage, ``same_*`` those at or since the last change of the current. ``slow_v`` and ``slow_a`` are means over ``FAST_S`` or
-``MEAN_SAMPLES``, ``slower_v`` is that of ``slow_v``.
+A loose wire or a stuck converter causes such values. In CHECKS, ``held_*`` are values at or since the last change of the
+voltage, and ``same_*`` are values at or since the last change of the current. ``slow_v`` and ``slow_a`` are running means over
+``FAST_S`` or ``MEAN_SAMPLES``. ``slower_v`` is the running mean of ``slow_v``.
 
 ``c`` is a record of CHECKS, ``f`` of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -14,11 +14,11 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 FAST_S = 10.0
-"""Maximum interval between samples at which changes of voltage and current are compared, and minimum averaging time of the slow
-means [s]."""
+"""Maximum interval between samples at which changes of voltage and current are compared, and minimum averaging time of the
+slow means [s]."""
 MEAN_SAMPLES = 3.0
-"""Minimum averaging time of the slow means, in samples. With one sample, the means are as noisy as the voltage: noise alone exceeds
-``NOISE_STEPS`` in 6.6 % of samples, instead of 0.04 % with three."""
+"""Minimum averaging time of the slow means, in samples. With one sample, the means are as noisy as the voltage: noise alone
+exceeds ``NOISE_STEPS`` in 6.6 % of samples, instead of 0.04 % with three."""
 VISIBLE_V = 0.003
 """Change of the overpotential of one cell that a working sensor certainly shows [V]."""
 SUSPECT_S = 5.0
@@ -28,8 +28,8 @@ FROZEN_S = 60.0
 SWING_V = 0.02
 """Change of the voltage of one cell that proves a constant current frozen [V]."""
 NOISE_STEPS = 4.0
-"""A constant current is frozen only if the voltage changes by more than this multiple of its mean change between two samples. A load
-moves the voltage seldom, noise at each sample, so that noise alone never exceeds the limit."""
+"""A constant current is frozen only if the voltage changes by more than this multiple of its mean change between two samples.
+Noise contributes to that mean at each sample and therefore does not exceed the limit. A load changes the voltage seldom."""
 MIN_RESOLUTION_STEPS = 3.0
 """Minimum change of the voltage for a proof, in multiples of its resolution."""
 OCV_CHANGE_V = 0.01
@@ -40,8 +40,8 @@ chargers regulate the voltage."""
 UNOBSERVED_CHARGE_ERROR = 0.1
 """Relative error of the charge counted while the voltage is not used."""
 OUTLIERS_S = 3600.0
-"""Time constant with which rejected single samples and single contradictions are discounted, and maximum averaging time of the noise
-[s]."""
+"""Time constant with which rejected single samples and single contradictions are discounted, and maximum averaging time of
+the noise [s]."""
 
 
 @njit(cache=True)
@@ -53,7 +53,7 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
     counted_s = min(dt_s, FAST_S)
     has_fast_changes = dt_s <= FAST_S and c.slow_v != 0.0  # 0: there are no slow means yet
     ocv_moved = voltage_stuck = False
-    # one step: with the default noise of half a step, sensor_v2 is step^2 / 4 + step^2 / 12 = step^2 / 3
+    # the root is one step: with the default noise of half a step, sensor_v2 is step^2 / 4 + step^2 / 12 = step^2 / 3
     resolved_v = MIN_RESOLUTION_STEPS * max(c.step_v, math.sqrt(3.0 * p.sensor_v2))
     change_v = abs(voltage_v - c.last_v)
     if c.last_v == 0.0 or change_v > 0.0:
@@ -104,7 +104,7 @@ def reference_series_resistance(p: Record) -> float:
 
 @njit(cache=True)
 def ocv_has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v: float) -> bool:
-    """Return True if the charge since the last voltage change moved the OCV by more than the overpotential's change."""
+    """Return True if the charge since the last voltage change moved the OCV by more than the overpotential has changed."""
     if f.count > 1:  # several hypotheses: the SOC is uncertain
         return False
     now_soc = c.held_soc - c.held_as / p.capacity_as
@@ -116,7 +116,7 @@ def ocv_has_moved(c: Record, f: Record, p: Record, current_a: float, resolved_v:
 
 @njit(cache=True)
 def rewind_to_freeze(c: Record, f: Record, p: Record) -> None:
-    """Restore the SOC before a sensor froze, plus the charge counted since then if only the voltage froze."""
+    """Restore the SOC before a sensor froze. If only the voltage froze, count the charge since then."""
     if c.frozen_a_s > FROZEN_S:
         f.soc, f.soc_std = c.same_soc, c.same_soc_std + p.load_mean_c * c.same_s / 3600.0
     else:

@@ -5,22 +5,22 @@
 
 import math
 
-from bms_estimator.kernels.cell_model.current_interpolation import SLOW_S
+from bms_estimator.kernels.cell_model.current_interpolation import RAMP_STEP_S
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
-LOAD_S = 600.0
+PRESENT_LOAD_S = 600.0
 """Averaging time of the present load, and expected duration of that load in a gap [s]."""
-USUAL_S = 6.0 * 3600.0
+LONG_TERM_S = 6.0 * 3600.0
 """Averaging time of the long-term mean load, which is expected after the present one in a long gap [s]."""
 INTERPOLATION_VARIANCE = 0.2
 """Variance of the mean current between two samples by linear interpolation, divided by the squared change of the current
-between the samples. It is 1/12 for loads that last much longer than a
-sample period, 0.10 and 0.18 for loads of 20 s sampled every 10 s and every 60 s, and 1/4 for independent samples."""
+between the samples. It is 1/12 for loads that last much longer than a sample period, 0.10 and 0.18 for loads of 20 s sampled
+every 10 s and every 60 s, and 1/4 for independent samples."""
 SKEW_VARIANCE = 2.0
-"""Variance of the current at a time between two samples about the straight line, divided by the squared change of the current
-between the samples and by f (1 - f), where f is the fraction of the time that has passed. It is 1 for one step at a random time,
-1.2 and 2.2 for a load whose levels last 20 s, in the middle between samples 10 s and 60 s apart, and 3 for independent values."""
+"""Variance of the current between two samples about the straight line, divided by f (1 - f) and by the squared change of the
+current between the samples. f is the fraction of the time that has passed. The ratio is 1 for one step at a random time, and 3
+for independent values. In the middle between samples 10 s and 60 s apart, a load whose levels last 20 s has 1.2 and 2.2."""
 MAX_EQUAL_STEPS = 1.5
 """Maximum difference between two reported currents that count as equal, in steps of the resolution."""
 MIN_UNMEASURED_STD_C = 0.1
@@ -48,10 +48,10 @@ def initialize_load_statistics(s: Record, p: Record, current_a: float) -> None:
 @njit(cache=True)
 def update_load_statistics(s: Record, current_a: float, dt_s: float) -> None:
     """Update mean and mean square of the present and the long-term load by ``current_a`` over ``dt_s``."""
-    share = min(1.0, dt_s / LOAD_S)
+    share = min(1.0, dt_s / PRESENT_LOAD_S)
     s.mean_a += share * (current_a - s.mean_a)
     s.rms_a2 += share * (current_a * current_a - s.rms_a2)
-    share = min(1.0, dt_s / USUAL_S)
+    share = min(1.0, dt_s / LONG_TERM_S)
     s.usual_a += share * (current_a - s.usual_a)
     s.usual_a2 += share * (current_a * current_a - s.usual_a2)
 
@@ -60,14 +60,14 @@ def update_load_statistics(s: Record, current_a: float, dt_s: float) -> None:
 def expected_excess_charge(s: Record, held_a: float, dt_s: float) -> float:
     """Return the expected charge in a gap of ``dt_s`` beyond ``held_a`` x ``dt_s`` [A s].
 
-    The present load is expected to end at random with the mean duration ``LOAD_S``.
+    The present load is expected to end at random with the mean duration ``PRESENT_LOAD_S``.
 
     Args:
         s: Record of EKF_STATE.
         held_a: Current that the caller counts over the gap [A].
         dt_s: Duration of the gap [s].
     """
-    return (s.mean_a - held_a) * LOAD_S * (1.0 - math.exp(-dt_s / LOAD_S))
+    return (s.mean_a - held_a) * PRESENT_LOAD_S * (1.0 - math.exp(-dt_s / PRESENT_LOAD_S))
 
 
 @njit(cache=True)
@@ -77,7 +77,7 @@ def gap_charge_std(s: Record, p: Record, held_a: float, dt_s: float) -> float:
     The unknown current is assumed constant over the gap. Its distribution changes from the present load in a short gap to
     the long-term load in a long gap.
     """
-    present_share = math.exp(-dt_s / LOAD_S)
+    present_share = math.exp(-dt_s / PRESENT_LOAD_S)
     present_a2 = s.rms_a2 - 2.0 * held_a * s.mean_a + held_a * held_a
     usual_a2 = s.usual_a2 - 2.0 * held_a * s.usual_a + held_a * held_a
     min_std_a = MIN_UNMEASURED_STD_C * p.capacity_as / 3600.0
@@ -99,7 +99,7 @@ def interpolation_charge_variance(change_a: float, dt_s: float) -> float:
         change_a: Change of the current between the samples [A].
         dt_s: Time between the samples [s].
     """
-    return INTERPOLATION_VARIANCE * (change_a * dt_s) ** 2 if dt_s > SLOW_S else 0.0
+    return INTERPOLATION_VARIANCE * (change_a * dt_s) ** 2 if dt_s > RAMP_STEP_S else 0.0
 
 
 @njit(cache=True)

@@ -27,7 +27,7 @@ from bms_estimator.kernels.kalman_filter.ekf import (
     update,
 )
 from bms_estimator.kernels.kalman_filter.gap_charge import (
-    USUAL_S,
+    LONG_TERM_S,
     initialize_load_statistics,
     update_load_statistics,
 )
@@ -73,15 +73,15 @@ from bms_estimator.numba_cache import njit
 MAX_STD_OF_ONE_HYPOTHESIS = 0.06
 """Maximum std of an initial SOC for which one filter suffices."""
 MAX_KEPT_STD = 1.0 / (HYPOTHESES - 2)
-"""Maximum std of the SOC after a gap with the usual load for which one hypothesis continues the state before the gap. It equals
-the spacing of the evenly spaced hypotheses, which represent a wider distribution well enough."""
+"""Maximum std of the SOC after a gap with the usual load at which one hypothesis represents this load. It equals the spacing of
+the evenly spaced hypotheses, which represent a wider distribution well enough."""
 SPREAD_STDS = 2.25
 """Distance of the outermost hypotheses from the initial SOC, in std of that SOC."""
 OVERLAP = 0.62
 """Std of a hypothesis, as a fraction of the distance between neighbors."""
 BEYOND_STD = 0.03
-"""Std over SOC with which the prior weight falls beyond ``MIN_SOC`` and ``MAX_SOC`` [SOC]. A hypothesis there is moved to the
-limit."""
+"""Std with which the prior weight of an SOC decreases beyond ``MIN_SOC`` and ``MAX_SOC`` [SOC]. A hypothesis there is moved to
+the limit."""
 HYST_STD = 0.7
 """Initial std of the hysteresis state h."""
 EARLIER_LOAD_S = 1800.0
@@ -96,8 +96,8 @@ REINITIALIZED_STD = 0.2
 PROBIT = 1.702
 """Factor with which the logistic function of a deviation in std approximates its normal probability within 0.01."""
 REPEATED_SHARE = 3.0
-"""Weight of ln S in repeated updates, per relative growth of the model's errors outside the temperature range of the cell file. The weight
-is 1 from 10 K outside. There the resistances are so uncertain that a hypothesis near empty fits every voltage."""
+"""Weight of ln S in repeated updates, per relative growth of the model's errors outside the temperature range of the cell file.
+The weight is 1 from 10 K outside. There the resistances are so uncertain that a hypothesis near empty fits every voltage."""
 MIN_PROBABILITY = 1e-12
 """Minimum prior probability of a hypothesis, so that its logarithm is finite."""
 EXCHANGE_STDS = 3.0
@@ -141,7 +141,7 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
 
 @njit(cache=True)
 def spawn_hypotheses(s: Record, p: Record, soc: float, soc_std: float) -> None:
-    """Initialize hypotheses around ``soc`` with the likeliest hypothesis's estimates of sensor and cell.
+    """Initialize hypotheses around ``soc`` with the most likely hypothesis's estimates of sensor and cell.
 
     SOC, polarization, hysteresis and errors of the model are unknown.
     """
@@ -200,7 +200,7 @@ def begin_search(s: Record) -> None:
 
 @njit(cache=True)
 def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
-    """Initialize hypotheses after a gap: usual use in the gap or a rest, and any SOC.
+    """Initialize hypotheses after a gap: one for the usual load or a rest in the gap, and others for any SOC.
 
     In the gap the pack may have been charged, discharged or exchanged, with a prior probability that grows with ``gap_s``
     [s]. Hypotheses with the same estimates of sensor and cell therefore cover SOC 0 to 1 evenly. One hypothesis remains
@@ -219,24 +219,25 @@ def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
     if std > MAX_KEPT_STD:
         kept = 0 if gap_s == math.inf else 1
         kept_probability *= rest_probability(soc, std, gap_s, rested)
-    even = HYPOTHESES - 1
-    spacing = 1.0 / (even - 1)
-    row = min(max(math.ceil(s.mean[kept, SOC] / spacing), 0), even)  # of the remaining hypothesis, in the order of SOC
+    even_count = HYPOTHESES - 1
+    spacing = 1.0 / (even_count - 1)
+    # index of the remaining hypothesis in the order of SOC
+    row = min(max(math.ceil(s.mean[kept, SOC] / spacing), 0), even_count)
     if row != kept:
         copy_hypothesis(s, kept, row)
     for k in range(BRANCHES):
         s.mean[row, X + k] += s.x_a[k]  # s.x_a becomes 0 below
-    # hypothesis ``first`` keeps the estimates of sensor and cell only, and is copied to the other evenly spaced ones
+    # hypothesis ``first`` retains only the estimates of sensor and cell, and is copied to the other evenly spaced ones
     first = 1 if row == 0 else 0
     copy_hypothesis(s, row, first)
     forget_state_of_charge(s, p, first)
     s.x_a[:] = 0.0
-    for n in range(even - 1, -1, -1):
+    for n in range(even_count - 1, -1, -1):
         q = n if n < row else n + 1
         if q != first:
             copy_hypothesis(s, first, q)
         set_initial_soc(s, p, q, n * spacing, OVERLAP * spacing)
-        weight = event / even + (1.0 - event - kept_probability) * spacing * normal_density(n * spacing, soc, std)
+        weight = event / even_count + (1.0 - event - kept_probability) * spacing * normal_density(n * spacing, soc, std)
         s.ln_weight[q] = math.log(max(weight, MIN_PROBABILITY))
     s.ln_weight[row] = math.log(max(kept_probability, MIN_PROBABILITY))
     s.count, s.best = HYPOTHESES, np.argmax(s.ln_weight)
@@ -247,13 +248,13 @@ def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
 def rest_probability(soc: float, std: float, gap_s: float, rested: bool) -> float:
     """Return the probability of a rest in a gap without a charge or an exchange.
 
-    A rest continues with the time constant ``USUAL_S``. A load cannot continue in an empty pack, nor a charge in a full one.
-    Therefore the probability of an SOC beyond 0 and 1 by the usual load, with mean ``soc`` and ``std``, is that of a rest.
+    A rest continues with the time constant ``LONG_TERM_S``. A load cannot continue in an empty pack, nor a charge in a full one.
+    The usual load leads to an SOC with mean ``soc`` and ``std``. A rest gets the probability of its part beyond 0 and 1.
     """
     if gap_s == math.inf:
         return 0.0
     beyond = 1.0 / (1.0 + math.exp(PROBIT * soc / std)) + 1.0 / (1.0 + math.exp(PROBIT * (1.0 - soc) / std))
-    return max(beyond, math.exp(-gap_s / USUAL_S) if rested else 0.0)
+    return max(beyond, math.exp(-gap_s / LONG_TERM_S) if rested else 0.0)
 
 
 @njit(cache=True)
@@ -336,8 +337,8 @@ def update_hypotheses(s: Record, p: Record) -> None:
 def update_weight(s: Record, p: Record, q: int, innovation_v: float, linear_v2: float, variance_v2: float) -> None:
     """Update the log-weight of hypothesis ``q``.
 
-    S excludes the linearization error, because that error is constant at rest: repeated each second, it would reject an SOC at a
-    knee of the OCV.
+    S excludes the linearization error. That error is constant at rest and would, repeated each second, reject an SOC at a knee of
+    the OCV.
 
     Args:
         s: Record of EKF_STATE.
@@ -361,15 +362,15 @@ def update_weight(s: Record, p: Record, q: int, innovation_v: float, linear_v2: 
 def repeated_variance(s: Record, p: Record, likeliest_v2: float, linear_v2: float, variance_v2: float) -> float:
     """Return the innovation variance for the weight of a hypothesis after the first update, between R and S [V^2].
 
-    S contains errors that persist from update to update, as that of the curve at a knee. Repeated each second, the term ln S would
-    reject a true SOC at the end of a plateau although it predicts each voltage. Therefore the variance that makes the innovation
-    likeliest replaces S. Outside the temperature range of the cell file S remains by ``REPEATED_SHARE``, because innovations are not
-    smaller there.
+    S contains errors that persist from update to update, such as that of the curve at a knee. Repeated each second, the term ln S
+    would reject a true SOC at the end of a plateau although it predicts each voltage. Therefore the maximum-likelihood variance
+    of the innovation replaces S. Outside the temperature range of the cell file, where innovations are not smaller,
+    ``REPEATED_SHARE`` retains a part of S.
 
     Args:
         s: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
-        likeliest_v2: Variance that makes the innovation likeliest [V^2].
+        likeliest_v2: Maximum-likelihood variance of the innovation [V^2].
         linear_v2: S without the linearization error [V^2].
         variance_v2: R [V^2].
     """
@@ -382,10 +383,9 @@ def repeated_variance(s: Record, p: Record, likeliest_v2: float, linear_v2: floa
 def innovation_scale(s: Record, p: Record) -> float:
     """Return the expected ratio of the innovation variance to S.
 
-    R and the biases cover the loads and cells that the file fits worst. The fit usually improves after the effects of the
-    load before switch-on have decayed. With innovations much smaller than S, the term ln S would decide between the
-    hypotheses and favor the smallest S. Outside the temperature range of the cell file the ratio increases and reaches 1
-    at a distance of ``OUTSIDE_K``.
+    R and the biases cover the loads and cells that the cell file describes worst. Innovations usually become smaller when the
+    effects of the load before switch-on have decayed. The term ln S would then decide between the hypotheses and favor the
+    smallest S. Outside the temperature range of the cell file the ratio increases and reaches 1 at a distance of ``OUTSIDE_K``.
     """
     return min(
         max(

@@ -32,9 +32,9 @@ from bms_estimator.numba_cache import njit
 GATE_STDS = 6.0
 """Limit of the innovation gate in std. A single sample beyond the gate is a glitch."""
 GATE_SAMPLES = 5
-"""Number of successive samples beyond the gate from which on samples are accepted, because the cell has changed."""
+"""Number of successive samples beyond the gate after which samples are accepted, because the cell has changed."""
 GATE_S = 5.0
-"""Duration of successive samples beyond the gate from which on samples are accepted [s]."""
+"""Duration of successive samples beyond the gate after which samples are accepted [s]."""
 SNAPSHOT_S = 60.0
 """Interval at which the last good state is stored [s]."""
 RESTORED_STD = 0.05
@@ -70,8 +70,8 @@ CLEAR_FRACTION = 0.7
 MAX_OCV_BIAS_V = 0.12
 """Mean bias of one cell above which the OCV counts as wrong [V]. An OCV of the cell's chemistry has smaller errors."""
 MAX_LEVEL_V = 0.03
-"""Difference between the level of a plateau and that of the curve, of one cell, above which the voltage counts as wrong [V]. Makes of
-LFP differ by 11 mV."""
+"""Maximum deviation of a plateau's voltage from that of the OCV curve, for one cell [V]. Beyond it the measured voltage counts as
+wrong. Makes of LFP differ by 11 mV."""
 OCV_BIAS_S = 1800.0
 """Averaging time of the mean bias that shows a wrong OCV [s]."""
 REINITIALIZATIONS_S = 5.0 * 3600.0
@@ -120,7 +120,7 @@ CHECKS = np.dtype(
         ("searches", "f8"),  # number of SOC re-initializations, discounted with REINITIALIZATIONS_S
         ("seen_reopened", "i8"),  # value of EKF_STATE.reopened at the last check
         ("suspects", "i8"),  # bits of model.input_faults.InputFault
-        ("good_mean", "f8", STATES),  # mean of the likeliest hypothesis in the last good state
+        ("good_mean", "f8", STATES),  # mean of the most likely hypothesis in the last good state
         ("good_covariance", "f8", (STATES, STATES)),  # covariance of that hypothesis
         ("good_soc", "f8"),  # SOC of the last good state
         ("good_soc_std", "f8"),  # std of the SOC of the last good state
@@ -197,7 +197,7 @@ def gate_persists(c: Record) -> bool:
 
 @njit(cache=True)
 def store_last_good_state(c: Record, f: Record) -> None:
-    """Store the likeliest hypothesis as the last good state."""
+    """Store the most likely hypothesis as the last good state."""
     for j in range(STATES):
         c.good_mean[j] = f.mean[f.best, j]
         for k in range(STATES):

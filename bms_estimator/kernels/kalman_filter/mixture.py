@@ -10,7 +10,7 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 MIN_LN_WEIGHT = -9.0
-"""ln of the ratio to the weight of the likeliest hypothesis, below which a hypothesis is removed."""
+"""Minimum log-weight of a hypothesis, relative to the most likely one. A hypothesis below it is removed."""
 MERGE_STDS = 0.7
 """SOC distance below which two neighboring hypotheses are merged, in multiples of the smaller SOC std of the two."""
 
@@ -75,8 +75,8 @@ def merge_pair(s: Record, a: int, b: int) -> None:
         s.mean[a, j] += share * difference[j]
     for j in range(STATES):
         for k in range(j, STATES):
-            both = s.covariance[a, j, k] + share * (s.covariance[b, j, k] - s.covariance[a, j, k])
-            s.covariance[a, j, k] = s.covariance[a, k, j] = both + share * (1.0 - share) * difference[j] * difference[k]
+            mean = s.covariance[a, j, k] + share * (s.covariance[b, j, k] - s.covariance[a, j, k])
+            s.covariance[a, j, k] = s.covariance[a, k, j] = mean + share * (1.0 - share) * difference[j] * difference[k]
     s.ln_weight[a] = max_ln_weight + math.log(weight_a + weight_b)
     if s.best == b:
         s.best = a

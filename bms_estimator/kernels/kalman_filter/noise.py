@@ -52,7 +52,7 @@ EARLY_EMPTY_SOC = 0.5
 KNEE_SLOPE_V = 1.0
 """Minimum slope of the OCV of one cell at its knee near empty [V]. On flatter parts ``curve_error_v`` covers the error of
 the curve."""
-USUAL_LN_R = 0.25
+BIAS_GROWTH_LN_R = 0.25
 """LN_R above which the variance of the biases grows with the resistances."""
 OUTSIDE_K = 30.0
 """Distance from the temperature range of the cell file at which the model's errors double [K]."""
@@ -98,7 +98,7 @@ def measurement_variance(s: Record, p: Record, dt_s: float, samples: int) -> flo
 
 @njit(cache=True)
 def skew_variance(s: Record, p: Record) -> float:
-    """Return the variance of the window's mean voltage by interpolated currents through R_0 [V^2].
+    """Return the variance of the window's mean voltage due to interpolated currents through R_0 [V^2].
 
     The covariance of the RC pairs contains their part.
     """
@@ -120,12 +120,12 @@ def bias_variance(s: Record, p: Record, q: int) -> float:
 def load_bias_variance(s: Record, p: Record, q: int, load_a2: float) -> float:
     """Return the variance of the model's error of hypothesis ``q`` under a load with the mean square ``load_a2`` [V^2].
 
-    The file's resistances have a relative error and a shift along SOC. The error grows with LN_R above ``USUAL_LN_R``.
+    The file's resistances have a relative error and a shift along SOC. The error grows with LN_R above ``BIAS_GROWTH_LN_R``.
 
     A cold cell is empty early by an amount that no file predicts. Below ``EARLY_EMPTY_SOC`` the shift along SOC therefore
     grows in the cold with the Arrhenius factor of the weak part, and it also shifts the knee of the OCV near empty.
     """
-    soc, scale = s.mean[q, SOC], math.exp(max(s.mean[q, LN_R] - USUAL_LN_R, 0.0))
+    soc, scale = s.mean[q, SOC], math.exp(max(s.mean[q, LN_R] - BIAS_GROWTH_LN_R, 0.0))
     ohm = total_resistance(s, p, soc)
     shift, early_v = p.bias_soc, 0.0
     if soc < EARLY_EMPTY_SOC:
@@ -244,10 +244,10 @@ def initial_branch_currents(p: Record, current_a: float, mean: Floats, covarianc
     one_c = p.capacity_as / 3600.0
     level_a2, load_a2, t = (p.load_level_c * one_c) ** 2, (p.load_c * one_c) ** 2, p.load_s
     for k in range(BRANCHES):
-        with_k = level_a2 + load_a2 * t / (t + TAUS[k])
+        covariance_k = level_a2 + load_a2 * t / (t + TAUS[k])
         mean[X + k] = p.load_mean_c * one_c
-        mean[X + k] += with_k / (level_a2 + load_a2) * (current_a - p.load_mean_c * one_c)
+        mean[X + k] += covariance_k / (level_a2 + load_a2) * (current_a - p.load_mean_c * one_c)
         for m in range(BRANCHES):
-            with_m = level_a2 + load_a2 * t / (t + TAUS[m])
-            both = level_a2 + load_a2 * branch_covariance(t, TAUS[k], TAUS[m])
-            covariance[X + k, X + m] = both - with_k * with_m / (level_a2 + load_a2)
+            covariance_m = level_a2 + load_a2 * t / (t + TAUS[m])
+            joint = level_a2 + load_a2 * branch_covariance(t, TAUS[k], TAUS[m])
+            covariance[X + k, X + m] = joint - covariance_k * covariance_m / (level_a2 + load_a2)

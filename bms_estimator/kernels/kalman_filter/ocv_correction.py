@@ -1,9 +1,9 @@
 """Correction of the cell file's OCV curve, learned by the filter as states at SOC nodes.
 
 The part ``constant_error_v`` of the curve's error recurs at each pass of an SOC. It is interpolated between ``NODES`` states,
-scaled so that the variance between nodes equals that at nodes. The states are in units of its std and are correlated along
-SOC: over ``CORRELATION_SOC``, or over the whole curve of a cell with a plateau, of which only the level is learned. The
-remaining error, CURVE, depends on temperature, load and history and varies.
+scaled so that the variance between nodes equals that at nodes. The states are in units of its std and are correlated over
+``CORRELATION_SOC``. With a plateau they are correlated over the whole curve, so that only its level is learned. The remaining
+error, CURVE, varies with temperature, load and history.
 
 A voltage depends on SOC and curve together, so that its information on the curve is limited by the uncertainty of the SOC.
 The joint covariance contains this limit, so that no rule has to select voltages for learning (as in simultaneous

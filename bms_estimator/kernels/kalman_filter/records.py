@@ -53,7 +53,8 @@ class Noise:
     bias_grown: float = 0.11
     """Bias: std relative to the increase of the resistances over their values at 25 C and SOC 0.5, in the cold and near empty."""
     bias_soc: float = 0.035
-    """Bias: shift of the resistances and of the OCV's knee near empty along SOC at 25 C; it grows with ``LOW_ACTIVATION_ENERGY``."""
+    """Bias: std of a shift along SOC, of the resistances and of the OCV's knee near empty, at 25 C. It grows in the cold with the
+    Arrhenius factor of ``LOW_ACTIVATION_ENERGY``."""
     slow_s: float = 3600.0
     """Bias: time constant of B_SLOW, which has half of the variance [s]."""
     fast_s: float = 45.0
@@ -125,16 +126,9 @@ EKF_SETTINGS = np.dtype(
         ("curve_soc", "f8", GRID),  # charge throughput over which the varying error of E_o changes [SOC]
         ("per_kelvin_v", "f8", GRID),  # dE_o/dT [V/K]
         ("hysteresis_v", "f8", GRID),  # half of E_o after charge less E_o after discharge, at 25 C [V]
-        (
-            "weak_ohm",
-            "f8",
-            (GRID, RESISTANCES),
-        ),  # resistances with activation energy LOW_ACTIVATION_ENERGY, at 25 C [ohm]
-        (
-            "strong_ohm",
-            "f8",
-            (GRID, RESISTANCES),
-        ),  # resistances with activation energy HIGH_ACTIVATION_ENERGY, at 25 C [ohm]
+        # parts of the resistances with LOW_ACTIVATION_ENERGY and with HIGH_ACTIVATION_ENERGY, at 25 C [ohm]
+        ("weak_ohm", "f8", (GRID, RESISTANCES)),
+        ("strong_ohm", "f8", (GRID, RESISTANCES)),
         ("middle_ohm", "f8"),  # sum of all resistances at SOC 0.5 and 25 C [ohm]
         ("low_c", "f8"),  # temperature range of the resistances, lower end [C]
         ("high_c", "f8"),  # temperature range of the resistances, upper end [C]
@@ -157,7 +151,7 @@ WINDOW = np.dtype(
         ("throughput_as", "f8"),  # sum of charge and discharge since the previous update [A s]
         ("unknown_as", "f8"),  # std of the charge in unmeasured gaps [A s]
         ("between_as2", "f8"),  # variance of the charge between samples far apart [A^2 s^2]
-        ("rounded_as2", "f8"),  # variance of the charge by rounding of the current [A^2 s^2]
+        ("rounded_as2", "f8"),  # variance of the charge due to rounding of the current [A^2 s^2]
         ("skew_a2", "f8"),  # sum over the samples of the variance of their interpolated currents [A^2]
         ("gap", "i8"),  # 1: samples are missing; 2: the gap may hide a charge or an exchange of the pack
         ("sum_v", "f8"),
@@ -192,7 +186,7 @@ EKF_STATE = np.dtype(
         ("fast_inflation", "f8", HYPOTHESES),  # factor on the variance of B_FAST
         ("slow_inflation", "f8", HYPOTHESES),  # factor on the variance of B_SLOW
         ("count", "i8"),  # number of hypotheses
-        ("best", "i8"),  # index of the likeliest hypothesis
+        ("best", "i8"),  # index of the most likely hypothesis
         ("started", "i8"),  # 1: initialized
         ("seeded_s", "f8"),  # time since the hypotheses were initialized [s]
         ("reopened", "i8"),  # number of re-initializations of the SOC because of an implausible bias
@@ -222,7 +216,7 @@ EKF_STATE = np.dtype(
         ("sensed", "i8"),  # 1: a temperature was reported
         ("soc", "f8"),  # mean SOC of the mixture
         ("soc_std", "f8"),  # std of the SOC of the mixture
-        ("voltage_v", "f8"),  # voltage predicted by the likeliest hypothesis [V]
+        ("voltage_v", "f8"),  # voltage predicted by the most likely hypothesis [V]
         ("innovation_v", "f8"),  # measured less predicted voltage [V]
         ("innovation_variance", "f8"),  # S [V^2]
         ("ohm", "f8", RESISTANCES),  # scratch space: resistances [ohm]

@@ -17,16 +17,16 @@ from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 
 VARYING, CONSTANT, STEPPED = range(3)
-"""Phases of ``detect_current_step``. VARYING: the current varies. CONSTANT: it is constant. STEPPED: it changed after CONSTANT."""
+"""Phases of ``detect_current_step``: the current varies, it is constant, or it has stepped from a constant current."""
 MIN_STEP_C = 0.2
 """Minimum change of the current between two samples of a current step, as a C-rate."""
 MAX_HELD_CHANGE = 0.1
 """Maximum change of a constant current, as a fraction of the step."""
 STEP_STD = 0.05
-"""Std of ln R_s by one step, due to kinetics and to timing errors of samples."""
+"""Std of ln R_s from one step, due to kinetics and to timing errors of samples."""
 FAST_STD = 0.5
 """Relative std of the RC pairs' change within the step."""
-SHAPE_STD = 0.3
+DRIFT_STD = 0.3
 """Std by which ln(R_s / R_0) drifts over the whole range of SOC, where R_0 is the series resistance of the cell file."""
 
 
@@ -43,7 +43,7 @@ def detect_current_step(s: Record, p: Record, dt_s: float, change_a: float, volt
     """
     step, min_step_a = s.step, MIN_STEP_C * p.capacity_as / 3600.0
     previous_phase, step.phase = step.phase, VARYING
-    step.variance += SHAPE_STD**2 * abs(s.current_a) * dt_s / p.capacity_as
+    step.variance += DRIFT_STD**2 * abs(s.current_a) * dt_s / p.capacity_as
     if dt_s > MAX_STEP_S:
         return
     stepped_a = abs(s.current_a - step.current_a)

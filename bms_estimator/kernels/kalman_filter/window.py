@@ -6,7 +6,7 @@
 import math
 
 from bms_estimator.kernels.cell_model.current_interpolation import (
-    SLOW_S,
+    RAMP_STEP_S,
     interpolated_current,
     ramp_correction,
 )
@@ -80,7 +80,7 @@ def integrate_current(s: Record, p: Record, dt_s: float, gap: bool, current_a: f
             s.decay[k] = math.exp(-dt_s / TAUS[k])
     for k in range(BRANCHES):
         s.x_a[k] = held_a + (s.x_a[k] - held_a) * s.decay[k]
-        if dt_s > SLOW_S and not unmeasured:
+        if dt_s > RAMP_STEP_S and not unmeasured:
             s.x_a[k] += ramp_correction(change_a, dt_s / TAUS[k], s.decay[k])
     w.time_s += dt_s
     w.charge_as += charge_as
@@ -112,11 +112,11 @@ def add_to_window(s: Record, current_a: float, voltage_v: float) -> None:
 
 @njit(cache=True)
 def widen_by_interpolation(w: Record, change_a: float, age_s: float, dt_s: float) -> None:
-    """Add the variances of a sample whose current is interpolated between two measured ones. Call before the sample.
+    """Add the variances of a sample whose current is interpolated between two measured ones. Call before ``integrate_current``.
 
     Args:
         w: Record of WINDOW.
-        change_a: Change of the current between the measured ones [A].
+        change_a: Change between the measured currents [A].
         age_s: Time from the first measured current to the sample [s].
         dt_s: Time between the measured currents [s].
     """

@@ -15,42 +15,42 @@ from bms_estimator.numba_cache import njit
 NAMES = ("r_s", "r_ts", "tau_ts", "r_tl", "tau_tl")
 """Identified elements, in the order of theta."""
 E_O = len(NAMES)
-"""Index of E_o [V] in ``given``, after the file's elements in the order of ``NAMES`` [ohm, s]."""
+"""Index of E_o [V] in ``constants``, after the file's elements in the order of ``NAMES`` [ohm, s]."""
 
 
 @njit(cache=True)
-def load_constants(given: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - the fuel cell model's function needs the temperature
-    """Write the cell file's elements and E_o at ``soc`` to ``given``; ``p`` is a record of ESTIMATOR_SETTINGS.
+def load_constants(constants: Floats, p: Record, soc: float, temperature_c: float) -> None:  # noqa: ARG001 - shared signature
+    """Write the cell file's elements and E_o at ``soc`` to ``constants``; ``p`` is a record of ESTIMATOR_SETTINGS.
 
     Below ``p.learning.soc_floor`` the elements are those at the floor, because a capacitance may be negative there
     (erratum 14).
     """
     a, limited_soc = p.learning.file, max(soc, p.learning.soc_floor)
-    given[0] = r_s(limited_soc, a)
-    given[1] = r_ts(limited_soc, a)
-    given[2] = given[1] * c_ts(limited_soc, a)
-    given[3] = r_tl(limited_soc, a)
-    given[4] = given[3] * c_tl(limited_soc, a)
-    given[E_O] = ocv(soc, p.observer.ocv_v, p.observer.ocv_slope_v)
+    constants[0] = r_s(limited_soc, a)
+    constants[1] = r_ts(limited_soc, a)
+    constants[2] = constants[1] * c_ts(limited_soc, a)
+    constants[3] = r_tl(limited_soc, a)
+    constants[4] = constants[3] * c_tl(limited_soc, a)
+    constants[E_O] = ocv(soc, p.observer.ocv_v, p.observer.ocv_slope_v)
 
 
 @njit(cache=True)
-def steady_state(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:  # noqa: ARG001
-    """Set the states of a cell at rest: the RC voltages are zero."""
+def steady_state(x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float) -> None:  # noqa: ARG001
+    """Set the states to those of a cell at rest: the RC voltages are zero."""
     x[:] = 0.0
     dx[:] = 0.0
 
 
 @njit(cache=True)
-def advance(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, dt_s: float) -> None:
+def advance(x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float, dt_s: float) -> None:
     """Advance both RC voltages and their derivatives by ``dt_s`` under a constant current, exactly.
 
     The equation is x' = (i R - x) / tau, (2.2)-(2.3).
     """
     for branch in range(2):
         r, tau = 1 + 2 * branch, 2 + 2 * branch
-        steady_v = current_a * given[r] * math.exp(theta[r])
-        lag = dt_s / (given[tau] * math.exp(theta[tau]))
+        steady_v = current_a * constants[r] * math.exp(theta[r])
+        lag = dt_s / (constants[tau] * math.exp(theta[tau]))
         decay = math.exp(-lag)
         dx[branch, r] = steady_v + (dx[branch, r] - steady_v) * decay
         dx[branch, tau] = (dx[branch, tau] + lag * (x[branch] - steady_v)) * decay
@@ -58,14 +58,14 @@ def advance(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: floa
 
 
 @njit(cache=True)
-def output(x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, psi: Floats) -> float:
+def output(x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float, psi: Floats) -> float:
     """Return the terminal voltage y^ (2.4) [V]; write dy^/dtheta to ``psi``."""
-    ohmic_v = current_a * given[0] * math.exp(theta[0])
+    ohmic_v = current_a * constants[0] * math.exp(theta[0])
     psi[0] = -ohmic_v
     for branch in range(2):
         r, tau = 1 + 2 * branch, 2 + 2 * branch
         psi[r], psi[tau] = -dx[branch, r], -dx[branch, tau]
-    return given[E_O] - x[0] - x[1] - ohmic_v  # (2.4)
+    return constants[E_O] - x[0] - x[1] - ohmic_v  # (2.4)
 
 
 @njit(cache=True)

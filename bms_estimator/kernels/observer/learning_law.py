@@ -197,7 +197,7 @@ def cholesky_factor(m: Record, q: Record) -> bool:
 
 @njit(cache=True)
 def apply_parameter_step(m: Record, q: Record, share: float) -> None:
-    """Move theta by ``share`` of the step within its bounds, and the states to those of the new theta.
+    """Move theta by ``share`` of the step within its bounds, and adjust the states to the new theta.
 
     The accumulated sensitivities are those of earlier theta, so that information is discounted with the squared step.
     """

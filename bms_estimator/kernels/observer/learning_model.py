@@ -27,39 +27,39 @@ NAMES = {Model.CHEN_MORA: chen_mora_sensitivity.NAMES, Model.FUEL_CELL: fuel_cel
 
 
 @njit(cache=True)
-def load_constants(model: int, given: Floats, p: Record, soc: float, temperature_c: float) -> None:
+def load_constants(model: int, constants: Floats, p: Record, soc: float, temperature_c: float) -> None:
     """Load the model's constants for this sample; ``p`` is a record of ESTIMATOR_SETTINGS."""
     if model == _CHEN_MORA:
-        chen_mora_sensitivity.load_constants(given, p, soc, temperature_c)
+        chen_mora_sensitivity.load_constants(constants, p, soc, temperature_c)
     elif model == _FUEL_CELL:
-        fuel_cell.load_constants(given, p, soc, temperature_c)
+        fuel_cell.load_constants(constants, p, soc, temperature_c)
 
 
 @njit(cache=True)
-def steady_state(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float) -> None:
+def steady_state(model: int, x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float) -> None:
     """Set states and derivatives in place to the steady state, for a sample with unknown history."""
     if model == _CHEN_MORA:
-        chen_mora_sensitivity.steady_state(x, dx, theta, given, current_a)
+        chen_mora_sensitivity.steady_state(x, dx, theta, constants, current_a)
     elif model == _FUEL_CELL:
-        fuel_cell.steady_state(x, dx, theta, given, current_a)
+        fuel_cell.steady_state(x, dx, theta, constants, current_a)
 
 
 @njit(cache=True)
-def advance(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, dt_s: float) -> None:
+def advance(model: int, x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float, dt_s: float) -> None:
     """Advance states ``x`` (2,) [V] and derivatives ``dx`` (2, 8) in place by ``dt_s`` under a constant current."""
     if model == _CHEN_MORA:
-        chen_mora_sensitivity.advance(x, dx, theta, given, current_a, dt_s)
+        chen_mora_sensitivity.advance(x, dx, theta, constants, current_a, dt_s)
     elif model == _FUEL_CELL:
-        fuel_cell.advance(x, dx, theta, given, current_a, dt_s)
+        fuel_cell.advance(x, dx, theta, constants, current_a, dt_s)
 
 
 @njit(cache=True)
-def output(model: int, x: Floats, dx: Floats, theta: Floats, given: Floats, current_a: float, psi: Floats) -> float:
+def output(model: int, x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float, psi: Floats) -> float:
     """Return the terminal voltage y^ [V]; write dy^/dtheta to ``psi`` (8,)."""
     if model == _CHEN_MORA:
-        return chen_mora_sensitivity.output(x, dx, theta, given, current_a, psi)
+        return chen_mora_sensitivity.output(x, dx, theta, constants, current_a, psi)
     if model == _FUEL_CELL:
-        return fuel_cell.output(x, dx, theta, given, current_a, psi)
+        return fuel_cell.output(x, dx, theta, constants, current_a, psi)
     return math.nan
 
 

@@ -18,14 +18,14 @@ LEARNING_SETTINGS = np.dtype(
         ("file", "f8", CONSTANTS),  # values at theta = 0
         ("lower", "f8", LEARNABLE),  # bounds of theta
         ("upper", "f8", LEARNABLE),
-        ("middle", "f8", LEARNABLE),  # theta to which the leakage leads
+        ("middle", "f8", LEARNABLE),  # theta that the leakage approaches
         ("leak_v2s", "f8", LEARNABLE),  # weight of the leakage, as information [V^2 s]
         ("memory_s", "f8"),  # time constant with which data are discounted under load [s]
         ("offset_s", "f8"),  # time constant with which the output error is added to the offset [s]; infinite: never
         ("settle_s", "f8"),  # time after which effects of unknown initial states have decayed [s]
         ("rate", "f8"),  # gamma: rate at which theta follows the data, at k = 1 [1/s]
         ("cells", "f8"),  # cells in series; k grows with the error of one cell
-        ("told_v", "f8"),  # size above which a sensitivity gives information on the parameters [V]
+        ("told_v", "f8"),  # sensitivity above which the data count as informative [V]
         ("reach", "f8"),  # trust region of theta: maximum step for which the sensitivities are valid
         ("soc_floor", "f8"),  # SOC below which learning is disabled (erratum 14)
     ],
@@ -35,9 +35,9 @@ LEARNING_SETTINGS = np.dtype(
 
 LEARNING_STATE = np.dtype(
     [
-        ("theta", "f8", LEARNABLE),  # ln of each parameter over the file's
+        ("theta", "f8", LEARNABLE),  # logarithm of each parameter over the file's value
         ("x", "f8", 2),  # states of the model [V]
-        ("dx", "f8", (2, LEARNABLE)),  # their derivatives by theta [V]
+        ("dx", "f8", (2, LEARNABLE)),  # derivatives of the states by theta [V]
         ("offset_v", "f8"),  # injected offset of the output [V]
         ("d_offset", "f8", LEARNABLE),  # derivative of offset_v by theta [V]
         ("psi", "f8", LEARNABLE),  # dy^/dtheta [V]

@@ -30,7 +30,7 @@ SERIES_LIMIT = 2.0
 TABLE_POINTS = 1025
 """Number of nodes of G over w = 1/(1 + r) in [0, 1/(1 + SERIES_LIMIT)], for a cubic Hermite error below 1e-12."""
 PANEL_NODES = 20
-"""Number of quadrature nodes of a panel in theta. More change no value of G by more than rounding."""
+"""Number of quadrature nodes of a panel in theta. More nodes change G by less than rounding."""
 PANELS = 60
 """Number of panels from s = 1 to each end. The last one is shorter than the resolution of theta in double precision."""
 PANEL_RATIO = 0.4
@@ -100,7 +100,7 @@ def _mean_of_exponentials(alpha: float) -> tuple[Floats, Floats]:
 
 
 def _quadrature_rule() -> tuple[Floats, Floats]:
-    """Return nodes and weights of Fejer's first rule on [-1, 1]. Those of Gauss depend on the CPU, by linear algebra."""
+    """Return nodes and weights of Fejer's first rule on [-1, 1]. Gauss's rule needs linear algebra, which depends on the CPU."""
     angles = [(k + 0.5) * math.pi / PANEL_NODES for k in range(PANEL_NODES)]
     orders = range(1, PANEL_NODES // 2 + 1)
     sums = [math.fsum(math.cos(2 * j * angle) / (4 * j * j - 1) for j in orders) for angle in angles]

@@ -4,9 +4,9 @@ Numbers in parentheses are equations of the thesis, and errata are listed in doc
 the thesis are ``v_ts`` and ``v_tl``.
 
 y, i, N and a_i are constant over a sample period. Then (3.2)-(3.3) with u = -N e is linear with a symmetric 2x2 matrix and
-is solved exactly. e is taken to decay with the eigenvalue that [1, 1] belongs to if both time constants are equal. (3.18)
-is a first-order lag, driven by the mean of e^2 over the period, and is solved exactly. Therefore the step is stable for
-every N >= 0 and every period. ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
+is solved exactly. e is assumed to decay with the eigenvalue of the mode [1, 1], as for equal time constants. (3.18) is a
+first-order lag, driven by the mean of e^2 over the period, and is solved exactly. Therefore the step is stable for every
+N >= 0 and every period. ``s`` is a record of OBSERVER_STATE, ``p`` of OBSERVER_SETTINGS.
 """
 
 import math
@@ -113,7 +113,7 @@ def update_margins(s: Record) -> None:
 
 @njit(cache=True)
 def stability_floor(s: Record, p: Record) -> float:
-    """Return the minimum SOC at which the circuit elements are evaluated. Below it, a capacitance may be negative (erratum 14)."""
+    """Return the minimum SOC for the circuit elements. Below it, a capacitance may be negative (erratum 14)."""
     return max(s.delta_1, s.delta_2) + p.margin_guard
 
 

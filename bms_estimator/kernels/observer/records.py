@@ -40,8 +40,8 @@ OBSERVER_SETTINGS = np.dtype(
         ("voltage_min_v", "f8"),  # minimum voltage of an accepted sample [V]
         ("voltage_max_v", "f8"),  # maximum voltage of an accepted sample [V]
         ("current_max_a", "f8"),  # maximum magnitude of the current of an accepted sample [A]
-        ("check_ohm", "f8"),  # series resistance at 50 % SOC by the cell file, for the check of the current [ohm]
-        ("check_slow_ohm", "f8"),  # resistance of the RC pairs at 50 % SOC by the cell file, for this check [ohm]
+        ("check_ohm", "f8"),  # series resistance of the cell file at SOC 0.5, for ``kernels.current_check`` [ohm]
+        ("check_slow_ohm", "f8"),  # resistance of the RC pairs of the cell file at SOC 0.5, for this check [ohm]
         ("check_v", "f8"),  # ohmic drop up to which a change of the current is not checked [V]
         # A longer step is a gap, unless it is at most GAP_RATIO times the previous step [s]
         ("gap_s", "f8"),
@@ -56,7 +56,7 @@ OBSERVER_STATE = np.dtype(
         ("current_a", "f8"),  # current of the last accepted sample [A]
         ("step_s", "f8"),  # time between the last two accepted samples [s]
         ("voltage_age_s", "f8"),  # age of the last measured voltage at the last accepted sample [s]
-        ("soc", "f8"),  # x1, 0..1: by the identifier, or by coulomb counting
+        ("soc", "f8"),  # x1, 0..1: from the identifier, or by coulomb counting
         ("soc_coulomb", "f8"),  # by coulomb counting alone (3.1), 0..1
         ("v_ts", "f8"),  # x2 [V]
         ("v_tl", "f8"),  # x3 [V]
@@ -81,7 +81,7 @@ OBSERVER_STATE = np.dtype(
         ("dropped_repeated", "i8"),  # samples with the time stamp of the previous one
         ("dropped_saturated", "i8"),  # voltage or current at the end of the converter's range
         ("dropped_contradicted", "i8"),  # samples with a current that the voltage does not follow
-        ("time_steps_back", "i8"),  # times that the clock was set back; the sample is accepted, but not the step to it
+        ("time_steps_back", "i8"),  # number of samples at which the clock was set back; the step to them is discarded
         ("gaps", "i8"),  # number of gaps (``kernels.step.is_gap``)
         ("lock_losses", "i8"),  # number of times that the lock was lost
         ("gain_rearms", "i8"),  # number of resets of k before the gain changed its sign

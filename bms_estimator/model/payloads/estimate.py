@@ -7,11 +7,11 @@ from pydantic import Field
 from bms_estimator.model.payloads.payload import Payload
 from bms_estimator.model.quantity import FAST_INTERVAL_S, Entity, Quantity, counter_entity, raw_entity, total_entity
 
-_COUNTED = "at the terminals over all runs, up to the last checkpoint where there is one; it never decreases"
+_COUNTED = "at the terminals over all runs; with checkpoints the last saved value, so that it never decreases"
 
 
 class Estimate(Payload):
-    """Topic ``state``: one publish window. V, I, P and temperature are means over the window, the rest is its last sample."""
+    """Topic ``state``: one publish window. Voltage, current, power and temperature are means, other values the last ones."""
 
     time: str = Field(description="arrival time of the window's last sample, ISO 8601, UTC")
     publish_time: str = Field(description="time at which this message was created, ISO 8601, UTC")
@@ -31,7 +31,7 @@ class Estimate(Payload):
         Field(description="mean temperature [C]; null without a sensor")
     )
     temperatures_c: list[float | None] | None = Field(
-        description="readings of all temperature probes at the last sample [C], null for an absent probe; null with a single probe"
+        description="readings of all temperature probes at the last sample [C], null for an absent probe; null with one probe"
     )
     faulty_probes: list[int] | None = Field(
         description="numbers of the faulty temperature probes at the last sample, starting at 1; null with a single probe"
@@ -69,8 +69,8 @@ class Estimate(Payload):
         "charge drawn; null without the identifier"
     )
     soc_known: bool = Field(
-        description="true if soc_std was below 0.12 and has not risen above 0.15 since, and always without the identifier; false: "
-        "soc is not shown, and no alarm uses it"
+        description="true: soc_std was below 0.12 and has not risen above 0.15 since, or there is no identifier; false: soc is "
+        "not shown, and no alarm uses it"
     )
     device_soc: Annotated[
         float | None,
@@ -79,7 +79,9 @@ class Estimate(Payload):
             packs="batteries",
             prometheus="ratio",
         ),
-    ] = Field(description="state of charge by the device (BMS, battery monitor), 0..1; null if it reports none")
+    ] = Field(
+        description="state of charge that the device (BMS, battery monitor) reports, 0..1; null if it reports none"
+    )
     device_soc_difference: Annotated[
         float | None,
         Quantity(
@@ -102,11 +104,11 @@ class Estimate(Payload):
         float | None,
         Quantity(Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", is_primary=True), packs="batteries"),
     ] = Field(
-        description="remaining energy at the terminals to the cut-off voltage at the present load and temperature [Wh]; null with a "
-        "forecast_reason without the identifier and for a fuel cell"
+        description="remaining energy at the terminals to the cut-off voltage at the present load and temperature [Wh]; null "
+        "without the identifier and for a fuel cell, with a forecast_reason"
     )
     time_to_cutoff_s: float | None = Field(
-        description="median time until the load is switched off at the cut-off voltage [s], under a load like the one seen; "
+        description="median time until the load is switched off at the cut-off voltage [s], under a load like the observed one; "
         "below 600 s use the quantiles and probabilities; null with a forecast_reason"
     )
     time_to_cutoff_p05_s: float | None = Field(description="5 % quantile of this time [s]")
@@ -149,8 +151,8 @@ class Estimate(Payload):
             prometheus="ratio",
         ),
     ] = Field(
-        description="SOC of the weakest cell, 0..1: by the cell voltages, or without them by the voltage of the bank; null for a single cell, "
-        "and before the first comparison",
+        description="SOC of the weakest cell, 0..1, from the cell voltages, or without them from the voltage of the bank; null "
+        "for a single cell, and before the first comparison",
     )
     weakest_cell_soc_std: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         description="standard deviation of weakest_cell_soc"
@@ -179,12 +181,12 @@ class Estimate(Payload):
             Entity("Cell spread, state of charge", "%", 1, 0.5, icon="arrow-expand-vertical", factor=100.0),
             packs="with cell voltages",
         ),
-    ] = Field(description="highest less lowest SOC of the cells; null as weakest_cell")
+    ] = Field(description="highest less lowest SOC of the cells; null if weakest_cell is null")
     cell_r_spread: Annotated[
         float | None,
         Quantity(raw_entity("Cell spread, resistance", "%", 0)._replace(factor=100.0), packs="with cell voltages"),
     ] = Field(
-        description="highest less lowest resistance of the cells, relative to their median; null as weakest_cell",
+        description="highest less lowest resistance of the cells, relative to their median; null if weakest_cell is null",
     )
     charge_out_ah: Annotated[
         float, Quantity(total_entity("Charge out", "Ah", 2)._replace(enabled=False), prometheus="counter")
@@ -202,11 +204,11 @@ class Estimate(Payload):
         float | None, Quantity(total_entity("Full cycles", None, 2)._replace(icon="sync"), packs="batteries")
     ] = Field(description="charge_out_ah divided by the rated capacity; null for a fuel cell")
     voltage_estimate_v: Annotated[float | None, Quantity(raw_entity("Estimated voltage", "V", 2, "voltage"))] = Field(
-        description="terminal voltage by the model: voltage_v less innovation_v [V]"
+        description="terminal voltage that the model predicts: voltage_v less innovation_v [V]"
     )
     innovation_v: Annotated[float | None, Quantity(raw_entity("Innovation", "V", 3, "voltage"))] = Field(
-        description="measured minus predicted voltage at the filter's last update [V]: the error of the model; without the identifier and "
-        "for a fuel cell equal to tracking_error_v"
+        description="measured minus predicted voltage at the filter's last update [V]: the error of the model; without the "
+        "identifier and for a fuel cell equal to tracking_error_v"
     )
     tracking_error_v: float | None = Field(
         description="the observer's tracking error e, (3.15) [V]; it is small even with a wrong model"
@@ -218,20 +220,21 @@ class Estimate(Payload):
         float | None, Quantity(raw_entity("delta 2", None, 4), packs="batteries", prometheus="ratio")
     ] = Field(description="SOC below which C_tl is negative, (2.12)")
     delta_configured: bool = Field(
-        description="true: delta_1 and delta_2 follow from the cell file and its bounds alone; false: the identifier has changed them by data, "
-        "or a fuel cell, which has neither"
+        description="true: delta_1 and delta_2 follow from the cell file and its bounds alone; false: data have changed them, or "
+        "the pack is a fuel cell, which has neither"
     )
     stability_margin: Annotated[
         float | None, Quantity(raw_entity("Stability margin", None, 3), packs="batteries", prometheus="ratio")
     ] = Field(
-        description="soc - max(delta_1, delta_2), the distance to the SOC below which the thesis's model is not valid; null with a "
-        "stability_margin_reason, and for a fuel cell"
+        description="soc - max(delta_1, delta_2), the distance to the SOC below which the thesis's model is not valid; null with "
+        "a stability_margin_reason, and for a fuel cell"
     )
     stability_margin_std: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         description="standard deviation of stability_margin"
     )
     stability_margin_reason: str | None = Field(
-        description="reason why stability_margin is null: the SOC is not known, neither delta_1 nor delta_2 is above 0, or a7..a12 are not valid"
+        description="reason why stability_margin is null: the SOC is not known, neither delta_1 nor delta_2 is above 0, or "
+        "a7..a12 are not valid"
     )
     adaptive_gain_k: Annotated[float | None, Quantity(raw_entity("Adaptive gain k", "V²s", 6))] = Field(
         description="adaptive gain state k, (3.13) [V^2 s]"
@@ -248,7 +251,7 @@ class Estimate(Payload):
     )
     frames_received: Annotated[int, Quantity(prometheus="counter")] = Field(description="valid frames since start")
     frames_lost: Annotated[int, Quantity(counter_entity("Frames lost"), prometheus="counter")] = Field(
-        description="missing frames by sequence number since start"
+        description="frames missing in the sequence numbers since start"
     )
     crc_errors: Annotated[int, Quantity(counter_entity("CRC errors"), prometheus="counter")] = Field(
         description="frames with a wrong checksum since start"

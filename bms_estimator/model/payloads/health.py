@@ -39,7 +39,7 @@ class PackModelHealth(Payload):
 
 
 class Totals(Payload):
-    """Totals over restarts; those after the last checkpoint before a kill are missing."""
+    """Totals over restarts, without the time from the last checkpoint to a kill."""
 
     since: str = Field(description="start of counting, ISO 8601, UTC")
     crashes: int = Field(description="starts after a run that did not end cleanly (fault, kill, power failure)")
@@ -60,7 +60,8 @@ class LoopHealth(Payload):
     """Delays of the event loop, and their causes."""
 
     latency_p50_s: float | None = Field(
-        description="median delay from the arrival of bytes to their estimate since the last health message [s]; null without samples"
+        description="median delay from the arrival of bytes to their estimate since the last health message [s]; null without "
+        "samples"
     )
     latency_p99_s: float | None = Field(description="99th percentile of this delay [s]")
     latency_max_s: float | None = Field(description="maximum of this delay [s]")

@@ -1,6 +1,6 @@
 """Payloads of one publication, for the topics ``forecast``, ``cells``, ``info``, ``alarm/<name>`` and ``parameters``.
 
-``estimate`` and ``health`` define the two other ones.
+The modules ``estimate`` and ``health`` define the payloads of the topics ``state`` and ``health``.
 """
 
 from typing import Literal, NamedTuple
@@ -18,8 +18,8 @@ class Parameter(Payload):
     value: float | None = Field(description="value in the unit of its name, or in ``unit``")
     std: float | None = Field(description="standard deviation in the same unit; null if unknown")
     valid: bool = Field(
-        description="true: data have determined the value, with a std below the limit that ``reason`` gives otherwise; a7..a12 also need time "
-        "constants from data. A configured value is never valid"
+        description="true: data have determined the value, with a std below a limit, which ``reason`` states if it is exceeded; "
+        "a7..a12 also need time constants from data. A configured value is never valid"
     )
     source: Literal["configured", "identified"]
     updated: str | None = Field(default=None, description="time of the last informative data, ISO 8601, UTC")
@@ -62,7 +62,9 @@ class Alarm(Payload):
 
     name: str = Field(description="name in the topic and in [alarms]")
     severity: Literal["warning", "critical"]
-    active: bool = Field(description="true: raised, and not yet cleared or, if it latches, acknowledged")
+    active: bool = Field(
+        description="true: raised and not yet cleared; a latching alarm remains active until acknowledged"
+    )
     latched: bool = Field(description="true: the cause is gone, and the alarm waits for an acknowledgment")
     since: str | None = Field(description="time at which it was raised, ISO 8601, UTC; null unless active")
     value: float | None = Field(description="measured value when it was raised, in unit; null without a number")
@@ -99,7 +101,7 @@ class Info(Payload):
         description="true: a cell temperature was received; without one 25 C is assumed and the resistances are less certain"
     )
     publish_rate_hz: float
-    board: dict[str, str] = Field(description="properties reported by the board; empty before")
+    board: dict[str, str] = Field(description="properties reported by the board; empty before the first report")
 
 
 CellFaultName = Literal["internal short", "contact", "sense wire", "wrong reading", "stuck reading"]
