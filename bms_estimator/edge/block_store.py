@@ -35,7 +35,7 @@ log = structlog.get_logger(__name__)
 
 
 class BlockStore:
-    """Stores blocks in order until a worker has confirmed them; implements ``mqtt.queue_sender.MessageQueue``.
+    """Store of blocks, in order, until a worker has confirmed them; implements ``mqtt.queue_sender.MessageQueue``.
 
     Args:
         database: Database with ``EDGE_TABLES``, synced at each transaction; its owner opens and closes it.
