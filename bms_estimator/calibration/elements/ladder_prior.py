@@ -61,7 +61,7 @@ def ocv_error(cell: CellModel) -> Floats:
 def _shapes(cell: CellModel, scale_ohm: float) -> Floats:
     """Return the prior shape of the weak and strong part of each resistance over SOC, at ``SOC_NODES``.
 
-    The shape of an identified ladder is used unchanged. Of a generic ladder the square root of the shape is used,
+    The shape of an identified ladder is used unchanged. For a generic ladder, the square root of the shape is used,
     because cells differ. The shape is constant for a cell with a voltage plateau, because the generic shape did not
     fit the captures of an LFP cell.
     """
@@ -70,7 +70,7 @@ def _shapes(cell: CellModel, scale_ohm: float) -> Floats:
         return np.ones((2, RESISTANCES, SOC_NODES.size))
     rows = _at_nodes(given)
     mean_ohm = rows[:, :, SOC_NODES > SHAPE_MIN_SOC].mean(axis=2, keepdims=True)
-    is_zero = mean_ohm < ZERO_FRACTION * scale_ohm  # has no shape
+    is_zero = mean_ohm < ZERO_FRACTION * scale_ohm  # a resistance of 0 has no shape
     shapes = np.clip(np.where(is_zero, 1.0, rows / np.where(is_zero, 1.0, mean_ohm)), *SHAPE_LIMITS)
     return np.asarray(np.sqrt(shapes) if given.std >= GENERIC_STD else shapes)
 

@@ -41,10 +41,10 @@ SHARE_SOC = (0.1, 0.95)
 def find_hysteresis_source(sources: Sequence[Source]) -> Source | None:
     """Return the source nearest to 25 C that shows hysteresis."""
     with_hysteresis = [source for source in sources if source.hysteresis_v is not None]
-    return min(with_hysteresis, key=lambda source: _from_reference(source.temperature_c), default=None)
+    return min(with_hysteresis, key=lambda source: _distance_from_reference(source.temperature_c), default=None)
 
 
-def _from_reference(temperature_c: float) -> float:
+def _distance_from_reference(temperature_c: float) -> float:
     return abs(float(np.nan_to_num(temperature_c, nan=REFERENCE_C)) - REFERENCE_C)
 
 
@@ -60,7 +60,9 @@ def measured_share(
     low, high = SHARE_SOC
     shares: list[float] = []
     for test, points in tests_with_points:
-        if _from_reference(test.temperature_c) > SHARE_K + _from_reference(hysteresis_source.temperature_c):
+        if _distance_from_reference(test.temperature_c) > SHARE_K + _distance_from_reference(
+            hysteresis_source.temperature_c
+        ):
             continue
         hysteresis_v = np.interp(
             points.soc,
@@ -95,7 +97,7 @@ def has_plateau(soc: Floats, ocv_v: Floats, series_count: int) -> bool:
     return float(slope_v.min()) < PLATEAU_V * series_count
 
 
-def centered(points: Points, hysteresis_at_rest_v: Floats, relative_std: float) -> Points:
+def center_points(points: Points, hysteresis_at_rest_v: Floats, relative_std: float) -> Points:
     """Move points to the mean of discharge and charge by a hysteresis with the error ``relative_std``."""
     hysteresis_v = np.interp(points.soc, GRID, hysteresis_at_rest_v)
     return replace(
@@ -106,25 +108,27 @@ def centered(points: Points, hysteresis_at_rest_v: Floats, relative_std: float) 
     )
 
 
-def center_on_typical_hysteresis(found: OcvSources, usual_v: Floats) -> OcvSources:
+def center_on_typical_hysteresis(found: OcvSources, typical_v: Floats) -> OcvSources:
     """Move sources without measured hysteresis to the mean of discharge and charge by a typical hysteresis.
 
     Args:
         found: Result of ``find_sources``.
-        usual_v: Hysteresis of similar cells after rests, at ``NODES`` and 25 C [V].
+        typical_v: Hysteresis of similar cells after rests, at ``NODES`` and 25 C [V].
     """
-    on_grid_v = np.interp(GRID, NODES, usual_v)
+    on_grid_v = np.interp(GRID, NODES, typical_v)
     moved = tuple(
         replace(
             source,
-            points=centered(source.points, on_grid_v * hysteresis_factor(source.temperature_c), TYPICAL_HYSTERESIS_STD),
+            points=center_points(
+                source.points, on_grid_v * hysteresis_factor(source.temperature_c), TYPICAL_HYSTERESIS_STD
+            ),
         )
         for source in found.sources
     )
     return replace(
         found,
         sources=moved,
-        hysteresis_v=usual_v,
-        hysteresis_std_v=TYPICAL_HYSTERESIS_STD * usual_v,
+        hysteresis_v=typical_v,
+        hysteresis_std_v=TYPICAL_HYSTERESIS_STD * typical_v,
         usual_hysteresis=True,
     )

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from bms_estimator.calibration.cleaning.start_soc import StartSoc
-from bms_estimator.calibration.ocv.points import Points, joined
+from bms_estimator.calibration.ocv.points import Points, join_points
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.calibration.ocv.slow_branch import SlowBranch
 from bms_estimator.model.arrays import Floats
@@ -12,13 +12,13 @@ from bms_estimator.model.sample import SampleBlock
 
 @dataclass(frozen=True)
 class Recording:
-    """Capture.
+    """Capture with the SOC at its start.
 
     Attributes:
         name: Name for messages.
         samples: Raw samples, dtype ``SAMPLE``.
-        start: SOC at the first sample; None: full for the captures that start at the highest voltage, otherwise by the OCV curve
-            of the other sources.
+        start: SOC at the first sample; None: full for the captures that start at the highest voltage, otherwise from the OCV
+            curve of the other sources.
     """
 
     name: str
@@ -75,7 +75,7 @@ class OcvSources:
 
     Attributes:
         capacity_ah: Given capacity, otherwise ``measured_ah`` [Ah].
-        measured_ah: Capacity by a full low-rate discharge [Ah]; NaN without one.
+        measured_ah: Capacity from a full low-rate discharge [Ah]; NaN without such a discharge.
         sources: Low-rate curves, given curves, and rests.
         tests: Relaxation tests among ``sources``.
         hysteresis_v: Hysteresis of a rested cell at ``NODES`` and 25 C [V], from the source nearest to 25 C that shows
@@ -95,4 +95,4 @@ class OcvSources:
     @property
     def points(self) -> Points:
         """Points of all sources."""
-        return joined([source.points for source in self.sources])
+        return join_points([source.points for source in self.sources])
