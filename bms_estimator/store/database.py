@@ -49,7 +49,7 @@ class StoreError(Exception):
 
 
 class Database:
-    """Runs transactions one after the other, in a new file if the existing file is unusable.
+    """Database that runs one transaction at a time. It replaces an unusable file by a new one.
 
     The caller repeats the work of a failed transaction in a later transaction.
 
@@ -61,7 +61,7 @@ class Database:
         retry_s: Delay after a failure before the disk is retried [s].
 
     Attributes:
-        reason: Reason for which the database is unavailable; empty while it is available.
+        reason: Reason why the database is unavailable; empty while it is available.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class _File:
     def run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run one transaction, in a new file if the existing one is unusable."""
         try:
-            return self._run(work)
+            return self._run_once(work)
         except (NewerVersionError, OtherTablesError) as error:
             self._quarantine(str(error))
         except UnicodeDecodeError as error:  # SQLite's error messages quote names of damaged tables
@@ -175,7 +175,7 @@ class _File:
             self._quarantine(str(error))
         except sqlite3.DatabaseError as error:
             code = getattr(error, "sqlite_errorcode", 0)
-            # plain READONLY comes from the file's header and not from permissions: the file was just opened for writing
+            # READONLY without an extended code comes from the file's header, because the file was just opened for writing
             # the lowest byte of an extended code is the primary code
             unusable = code == sqlite3.SQLITE_READONLY or code & 0xFF in (
                 UNUSABLE_CODES if self._ready else UNUSABLE_CODES_AT_OPEN
@@ -183,9 +183,9 @@ class _File:
             if not unusable:
                 raise
             self._quarantine(str(error))
-        return self._run(work)
+        return self._run_once(work)
 
-    def _run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
+    def _run_once(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run one transaction; open the file if necessary, and close it after an error."""
         try:
             connection = self._open()

@@ -125,7 +125,7 @@ __all__ = ["Outbox", "QueuedMessage"]
 
 
 class Outbox:
-    """Stores messages in order until the broker acknowledges them.
+    """Store of messages, in order, until the broker acknowledges them.
 
     Args:
         database: Database for messages during an outage; None: memory only.
