@@ -16,7 +16,7 @@ import structlog
 from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.store.migrations import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
 
-HANG_S = 10.0
+DISK_TIMEOUT_S = 10.0
 """Timeout after which the disk counts as hung [s]."""
 SHUTDOWN_TIMEOUT_S = 5.0
 """Timeout of all writes during shutdown [s]."""
@@ -57,7 +57,7 @@ class Database:
         path: Database file, created if missing.
         tables: Statements that create the tables, in the format of ``MIGRATIONS``.
         sync_s: Minimum interval between two fsyncs [s].
-        hang_s: Timeout of a transaction [s].
+        disk_timeout_s: Timeout of a transaction [s].
         retry_s: Delay after a failure before the disk is retried [s].
 
     Attributes:
@@ -70,11 +70,11 @@ class Database:
         *,
         tables: tuple[str, ...] = MIGRATIONS,
         sync_s: float = SYNC_S,
-        hang_s: float = HANG_S,
+        disk_timeout_s: float = DISK_TIMEOUT_S,
         retry_s: float = RETRY_S,
     ) -> None:
         self.path, self.reason = path, ""
-        self._hang_s, self._retry_s = hang_s, retry_s
+        self._disk_timeout_s, self._retry_s = disk_timeout_s, retry_s
         self._thread = DaemonThreadExecutor("database")
         self._hung_call: asyncio.Future[Any] | None = None
         self._last_failure_s = -retry_s
@@ -100,7 +100,7 @@ class Database:
 
     async def _wait(self, waiter: asyncio.Future[Any]) -> bool:
         """Return True if the disk responded in time."""
-        due_s = min(asyncio.get_running_loop().time() + self._hang_s, self._shutdown_end_s)
+        due_s = min(asyncio.get_running_loop().time() + self._disk_timeout_s, self._shutdown_end_s)
         try:
             async with asyncio.timeout_at(due_s) as timeout:
                 self._open_timeouts.add(timeout)

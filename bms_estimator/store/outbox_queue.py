@@ -150,10 +150,10 @@ class OutboxQueue:
         if len(self._tail) > MAX_TAIL:
             self._drop_oldest(only_tail=True)
 
-    def take_next(self, most: int) -> list[QueuedMessage]:
-        """Return up to ``most`` of the oldest messages in memory, which are then in flight."""
+    def take_next(self, max_count: int) -> list[QueuedMessage]:
+        """Return up to ``max_count`` of the oldest messages in memory, which are then in flight."""
         taken: list[QueuedMessage] = []
-        while len(taken) < most and self.can_take:
+        while len(taken) < max_count and self.can_take:
             taken.append((self._ready or self._tail).popleft())
         self.in_flight |= {queued.number: queued for queued in taken}
         return taken

@@ -12,7 +12,7 @@ from bms_estimator.calibration.elements.ladder_fit import (
     ZERO_FRACTION,
     Prior,
 )
-from bms_estimator.calibration.ocv.hysteresis import REST_SHARE_STD, has_plateau
+from bms_estimator.calibration.ocv.hysteresis import RESTED_FRACTION_STD, has_plateau
 from bms_estimator.calibration.ocv.slow_curve import PAIR_V
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.settings_records import ocv_grid
@@ -96,7 +96,7 @@ def _curve_error(cell: CellModel) -> Floats:
     error_v = ocv_error(cell)
     if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:
         return error_v
-    hysteresis_v = REST_SHARE_STD * np.interp(EVEN_SOC, cell.ocv.soc, cell.ocv.hysteresis_v)
+    hysteresis_v = RESTED_FRACTION_STD * np.interp(EVEN_SOC, cell.ocv.soc, cell.ocv.hysteresis_v)
     square_v2: Floats = np.maximum(error_v**2 - hysteresis_v**2, (PAIR_V * cell.cell.series_count) ** 2)
     return np.sqrt(square_v2)
 

@@ -81,7 +81,7 @@ class OcvSources:
         hysteresis_v: Hysteresis of a rested cell at ``NODES`` and 25 C [V], from the source nearest to 25 C that shows
             hysteresis; None without such a source.
         hysteresis_std_v: Standard deviation of ``hysteresis_v`` [V].
-        usual_hysteresis: True if ``hysteresis_v`` comes from typical cells (``center_on_typical_hysteresis``).
+        has_typical_hysteresis: True if ``hysteresis_v`` comes from typical cells (``center_on_typical_hysteresis``).
     """
 
     capacity_ah: float
@@ -90,7 +90,7 @@ class OcvSources:
     tests: tuple[RelaxationTest, ...]
     hysteresis_v: Floats | None
     hysteresis_std_v: Floats
-    usual_hysteresis: bool = False
+    has_typical_hysteresis: bool = False
 
     @property
     def points(self) -> Points:

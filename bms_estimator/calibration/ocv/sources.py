@@ -8,13 +8,13 @@ import numpy as np
 from bms_estimator.calibration.cleaning.rests import remove_glitches
 from bms_estimator.calibration.cleaning.start_soc import SAME_START_V, StartSoc
 from bms_estimator.calibration.ocv.hysteresis import (
-    REST_SHARE_STD,
+    RESTED_FRACTION_STD,
     center_points,
     find_hysteresis_source,
     has_plateau,
     hysteresis_factor,
-    measured_share,
-    typical_share,
+    measured_rested_fraction,
+    typical_rested_fraction,
 )
 from bms_estimator.calibration.ocv.overpotential import steady_drop
 from bms_estimator.calibration.ocv.points import Points, join_points, points_of
@@ -83,22 +83,27 @@ def find_sources(
     hysteresis_source = find_hysteresis_source(sources)
     hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
     if hysteresis_source is not None and hysteresis_source.hysteresis_v is not None:
-        share = measured_share(hysteresis_source, tests_with_points)
+        rested_fraction = measured_rested_fraction(hysteresis_source, tests_with_points)
         half_difference_v = hysteresis_source.hysteresis_v / hysteresis_factor(hysteresis_source.temperature_c)
         hysteresis_at_rest_v = half_difference_v * (
-            typical_share(hysteresis_source, series_count) if share is None else share
+            typical_rested_fraction(hysteresis_source, series_count) if rested_fraction is None else rested_fraction
         )
         # the hysteresis of a given curve is used unchanged, unless rests measure its fraction
-        is_unchanged = hysteresis_source in sources[len(slow) :] and share is None
+        is_unchanged = hysteresis_source in sources[len(slow) :] and rested_fraction is None
         hysteresis_v = np.interp(NODES, GRID, half_difference_v if is_unchanged else hysteresis_at_rest_v)
-        hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_difference_v)
+        hysteresis_std_v = RESTED_FRACTION_STD * np.interp(NODES, GRID, half_difference_v)
         tests_with_points = [
-            (test, center_points(points, hysteresis_at_rest_v * hysteresis_factor(test.temperature_c), REST_SHARE_STD))
+            (
+                test,
+                center_points(
+                    points, hysteresis_at_rest_v * hysteresis_factor(test.temperature_c), RESTED_FRACTION_STD
+                ),
+            )
             for test, points in tests_with_points
         ]
-        if share is not None:
+        if rested_fraction is not None:
             sources = [
-                replace(source, notes=(*source.notes, f"rests keep {share:.2f} of its hysteresis"))
+                replace(source, notes=(*source.notes, f"rests keep {rested_fraction:.2f} of its hysteresis"))
                 if source is hysteresis_source
                 else source
                 for source in sources

@@ -22,7 +22,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-SETTLED_SHARE = 0.99
+SETTLED_FRACTION = 0.99
 """Minimum fraction of the samples after t_int whose error is within its bound."""
 SETTLED_PARAMETER = 1e-3
 """Maximum relative deviation of a settled parameter from its median."""
@@ -90,7 +90,7 @@ def averaging_window(
     remaining = np.arange(large.size, 0, -1)
     # fraction of large errors in each sample and its successors
     large_fraction = np.cumsum(large[::-1])[::-1] / remaining
-    settled = (large_fraction <= 1.0 - SETTLED_SHARE) & ~large
+    settled = (large_fraction <= 1.0 - SETTLED_FRACTION) & ~large
     if not settled.any():
         # the window contains only its last sample, and ``average_parameters`` returns the values of that sample
         reason = f"the error never settles within {1e3 * epsilon_v:.2f} mV"
@@ -166,7 +166,7 @@ SNAPSHOTS = 3000
 """Maximum number of equidistant snapshots of a_i(t) over a run, in addition to ``FIRST_SAMPLES``."""
 FIRST_SAMPLES = 200
 """Number of first samples that are all recorded, because a_i(t) moves from its initial value to its limit there."""
-CONVERGED_SHARE = 0.95
+CONVERGED_FRACTION = 0.95
 """Minimum fraction of the samples between t_int and t_unst whose error is within eps2."""
 
 SNAPSHOT_FIELDS = (
@@ -332,9 +332,9 @@ def _outcome(window: AveragingWindow, time_s: Floats, error_v: Floats, epsilon_v
     if inside.sum() < 2:
         worst = float(np.abs(error_v[time_s <= window.t_unst_s]).max(initial=0.0))
         return f"not converged: {window.start_reason}; largest |e| {1e3 * worst:.2f} mV until {window.t_unst_s:.0f} s"
-    share = float((np.abs(error_v[inside]) <= epsilon_v).mean())
-    if share < CONVERGED_SHARE:
-        return f"not converged: |e| is within {1e3 * epsilon_v:.2f} mV for {100 * share:.1f} % of the samples only"
+    fraction = float((np.abs(error_v[inside]) <= epsilon_v).mean())
+    if fraction < CONVERGED_FRACTION:
+        return f"not converged: |e| is within {1e3 * epsilon_v:.2f} mV for {100 * fraction:.1f} % of the samples only"
     if lock_losses:
         return f"not converged: lock was lost {lock_losses} times"
     return "converged"
