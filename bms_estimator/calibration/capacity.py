@@ -1,4 +1,4 @@
-"""Capacity from anchors: SOC by the open-circuit voltage of rests, and the charge counted between them.
+"""Capacity from anchors: SOC from the open-circuit voltage of rests, and the charge counted between them.
 
     z_k = z_c - Ah_k / Q + (offset / Q) t_k
 
@@ -51,7 +51,7 @@ class Capacity:
         offset_a: Offset of the current sensor [A]; near 0 if the anchors do not determine it.
         offset_std_a: Standard deviation of the offset [A].
         anchors: Anchors that were used.
-        residual: Residual of each anchor: SOC by its voltage minus SOC by the charge.
+        residual: Residual of each anchor: SOC from its voltage minus SOC from the charge.
         rejected: Reasons why other rests were rejected, one line each.
     """
 
@@ -65,7 +65,7 @@ class Capacity:
 
 
 def measure_capacity(captures: Sequence[Columns], cell: CellModel, *, offset_std_a: float | None = None) -> Capacity:
-    """Measure the capacity by the anchors of one or more captures of a cell.
+    """Measure the capacity from the anchors of one or more captures of a cell.
 
     Args:
         captures: Captures of one cell, recorded within weeks, so that its capacity is constant.

@@ -41,7 +41,7 @@ class Anchor:
         part: Number of the continuous part, over all captures.
         time_s: Time of the rest's end, on the capture's clock [s].
         rest: The detected rest.
-        soc: SOC by the rest's voltage.
+        soc: SOC from the rest's voltage.
         slope_v: Slope dOCV/dSOC at ``soc`` [V].
         voltage_std_v: Standard deviation of the rest's OCV without the error of the curve, independent of other anchors [V].
         curve_std_v: Standard deviation of the OCV curve at ``soc``, correlated between anchors [V].
@@ -72,7 +72,7 @@ class Anchor:
 
 
 class _SocOfRest(NamedTuple):
-    """SOC by the voltage of a rest; each field as in ``Anchor``."""
+    """SOC from the voltage of a rest; each field as in ``Anchor``."""
 
     soc: float
     slope_v: float
@@ -172,7 +172,7 @@ def continuous_parts(good: SampleBlock, capacity_ah: float) -> list[tuple[int, i
 
 
 def _soc_of_rest(rest: Rest, settings: np.void, hysteresis_mean: float, hysteresis_std: float) -> _SocOfRest:
-    """Return the SOC by the voltage of a rest, with mean and std of the hysteresis state h at 25 °C."""
+    """Return the SOC from the voltage of a rest, with mean and std of the hysteresis state h at 25 °C."""
     curve = settings["ocv_v"], settings["ocv_slope_v"]
     temperature_c = float(np.nan_to_num(rest.temperature_c, nan=REFERENCE_C))
     amplitude = arrhenius(HYSTERESIS_ACTIVATION_ENERGY, temperature_c)  # of the hysteresis, relative to 25 °C

@@ -76,7 +76,7 @@ class FuelCellFit:
 
     Attributes:
         model: The stack with its parameters, and their errors in ``std``.
-        rms_v: Residual voltage by the name of each source, RMS [V].
+        rms_v: RMS residual voltage of each source, by name [V].
         undetermined: Reason why a parameter keeps its initial value, by its key in ``[fuel_cell]``.
     """
 

@@ -52,8 +52,8 @@ PEAK_CURRENT_MARGIN = 1.5
 MIN_DISCHARGED_SOC = 0.05
 """Minimum SOC that a capture draws if the SOC at its start matters. A charge is counted from its end."""
 AMBIGUOUS_SOC = (0.05, 0.9)
-"""SOC range of a voltage that is half full in another chemistry: 3.5 V is a full LFP cell or a nearly empty NMC cell. The plateau of
-the curve distinguishes them."""
+"""SOCs of another chemistry at which a voltage does not prove a full cell: 3.5 V is a full LFP cell or a nearly empty NMC cell.
+The plateau of the curve distinguishes them."""
 
 
 class OcvForm(StrEnum):
@@ -99,7 +99,7 @@ def determine_ocv(
         curves: Given curves.
         name: Name of the cell.
         form: Form of the open-circuit voltage.
-        capacity_ah: Capacity with which the SOC is counted [Ah]; None: capacity by a full slow discharge.
+        capacity_ah: Capacity with which the SOC is counted [Ah]; None: capacity from a full slow discharge.
         initial_soc: SOC 0..1 at the first sample of the captures without a ``start`` that start at the highest voltage; None: 1,
             if this is the voltage of a full cell.
         series_count: Cells in series; None: estimated from the median voltage.
@@ -155,8 +155,8 @@ def _require_full_start(
     series, grid = generic.cell.series_count, ocv_grid(generic)
     others = [ocv_grid(load_cell(each, capacity_ah).pack(series, 1)) for each in generic_cells()]
     is_ambiguous = any(AMBIGUOUS_SOC[0] < soc_from_ocv(start_v, *each) < AMBIGUOUS_SOC[1] for each in others)
-    has_shape = has_plateau(NODES, preliminary_v, series) == has_plateau(NODES, ocv_of_each(NODES, *grid), series)
-    if soc_from_ocv(start_v, *grid) < FULL_SOC or (is_ambiguous and not has_shape):
+    has_same_shape = has_plateau(NODES, preliminary_v, series) == has_plateau(NODES, ocv_of_each(NODES, *grid), series)
+    if soc_from_ocv(start_v, *grid) < FULL_SOC or (is_ambiguous and not has_same_shape):
         raise UserError(
             f"--soc: not given, and nothing proves that the cell is full at the start of {name}: the first rest has "
             f"{start_v / series:.3f} V per cell; give the SOC at the start, which is 1 for a full cell"

@@ -35,7 +35,7 @@ FLOOR_QUANTILE = 0.02
 FLOOR_TOLERANCE = 0.2
 """Maximum deviation of a sample from the current between the loads, relative to this current."""
 MIN_LOAD_FACTOR = 5.0
-"""Minimum ratio of the largest current to the current between the loads. With a constant load, both are the same."""
+"""Minimum ratio of the largest current to the current between the loads. With a constant load, both are equal."""
 MIN_FLOORS = 3
 """Minimum number of periods between loads."""
 MIN_FLOOR_FRACTION = 0.1
@@ -156,9 +156,9 @@ def _outside(validation: Validation, cell: CellModel) -> str | None:
 
 def _explanation(curve: _Curve, validation: Validation, cell: CellModel) -> str | None:
     """Return a sentence if a correction of the reference explains most of the voltage error."""
-    corrections = [_capacity(curve, validation, cell), _offset(curve, cell)]
+    corrections = [_capacity_correction(curve, validation, cell), _offset_correction(curve, cell)]
     if validation.initial_soc_from in {GIVEN, UNDER_LOAD} or not curve.start_shows_shift():
-        corrections.append(_start(curve, validation))
+        corrections.append(_start_correction(curve, validation))
     limit_v = MAX_UNEXPLAINED * curve.rms_v(curve.soc)
     found = sorted((each for each in corrections if each and each.rms_v <= limit_v), key=lambda each: each.rms_v)
     if not found:
@@ -170,7 +170,7 @@ def _explanation(curve: _Curve, validation: Validation, cell: CellModel) -> str 
     )
 
 
-def _best(curve: _Curve, factors: Floats, shift: Floats) -> tuple[int, float] | None:
+def _best_factor(curve: _Curve, factors: Floats, shift: Floats) -> tuple[int, float] | None:
     """Return the index of the factor with the smallest error and this error [V]; None if it is the first or the last factor.
 
     Args:
@@ -183,16 +183,16 @@ def _best(curve: _Curve, factors: Floats, shift: Floats) -> tuple[int, float] | 
     return (best, errors_v[best]) if 0 < best < len(errors_v) - 1 else None
 
 
-def _capacity(curve: _Curve, validation: Validation, cell: CellModel) -> _Correction | None:
-    best = _best(curve, 1.0 / CAPACITY_RATIOS - 1.0, curve.soc - validation.initial_soc)
+def _capacity_correction(curve: _Curve, validation: Validation, cell: CellModel) -> _Correction | None:
+    best = _best_factor(curve, 1.0 / CAPACITY_RATIOS - 1.0, curve.soc - validation.initial_soc)
     if best is None:
         return None
     text = f"a capacity of about {cell.cell.capacity_ah * CAPACITY_RATIOS[best[0]]:.3g} Ah (--capacity-ah)"
     return _Correction(text, best[1])
 
 
-def _offset(curve: _Curve, cell: CellModel) -> _Correction | None:
-    best = _best(curve, OFFSET_C_RATES, curve.hours)
+def _offset_correction(curve: _Curve, cell: CellModel) -> _Correction | None:
+    best = _best_factor(curve, OFFSET_C_RATES, curve.hours)
     if best is None:
         return None
     offset_a = OFFSET_C_RATES[best[0]] * cell.cell.capacity_ah
@@ -201,8 +201,8 @@ def _offset(curve: _Curve, cell: CellModel) -> _Correction | None:
     return _Correction(text, best[1])
 
 
-def _start(curve: _Curve, validation: Validation) -> _Correction | None:
-    best = _best(curve, START_SHIFTS, np.ones(curve.soc.size))
+def _start_correction(curve: _Curve, validation: Validation) -> _Correction | None:
+    best = _best_factor(curve, START_SHIFTS, np.ones(curve.soc.size))
     if best is None:
         return None
     soc = min(max(validation.initial_soc + START_SHIFTS[best[0]], 0.0), 1.0)

@@ -52,7 +52,7 @@ def soc_errors(pack: Pack, rows: SampleBlock, validation: Validation, on_block: 
     """Run a pack over the samples of a validation, and compare its SOC with coulomb counting.
 
     The first ``SETTLING_S`` are not scored, because the estimator searches its initial SOC. SOCs below ``MIN_SOC`` are not
-    scored either. If voltage and current of a sample are of different sides of a step, the voltage is marked as held.
+    scored either. If voltage and current of a sample belong to different sides of a step, the voltage is marked as held.
     Otherwise the resistance would seem to be 0 or negative.
 
     Args:
@@ -83,7 +83,7 @@ def soc_errors(pack: Pack, rows: SampleBlock, validation: Validation, on_block: 
 
 
 def _with_held_voltages(rows: SampleBlock) -> SampleBlock:
-    """Return the samples with ``VOLTAGE_HELD`` where voltage and current are of different sides of a step."""
+    """Return the samples with ``VOLTAGE_HELD`` where voltage and current belong to different sides of a step."""
     finite = np.flatnonzero(
         np.isfinite(rows["time_s"]) & np.isfinite(rows["current_a"]) & np.isfinite(rows["voltage_v"])
     )

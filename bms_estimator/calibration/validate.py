@@ -117,55 +117,57 @@ def validate(capture: Columns, cell: CellModel, *, initial_soc: float | None = N
         capture: Raw samples, rows of dtype ``SAMPLE``; it should start from rest.
         cell: Cell to validate.
         initial_soc: SOC 0..1 at the first good sample; None: from the voltage of the first rest.
-        from_s: Time since the first good sample from which on the errors are evaluated [s]. The simulation begins before.
+        from_s: Time since the first good sample after which the errors are evaluated [s]. The simulation begins before.
 
     Raises:
         UserError: Most samples lie outside the cell's limits, or SOC runs outside 0..1.
     """
-    load = clean_capture(capture.name, capture.rows, cell)
-    start = soc_of_first_rest(load, cell) if initial_soc is None else initial_soc
-    warnings = capture_contradictions(load, cell, start)
-    outside = soc_outside(load, cell, start)
+    clean = clean_capture(capture.name, capture.rows, cell)
+    start = soc_of_first_rest(clean, cell) if initial_soc is None else initial_soc
+    warnings = capture_contradictions(clean, cell, start)
+    outside = soc_outside(clean, cell, start)
     if outside:
         raise UserError("\n".join(dict.fromkeys([*warnings, f"{capture.name}: {outside}"])))
-    soc = start - load.discharged_ah / cell.cell.capacity_ah
+    soc = start - clean.discharged_ah / cell.cell.capacity_ah
     grid = ocv_grid(cell)
-    error_v = load.voltage_v - ocv_of_each(soc, *grid) + overpotential(cell, load, soc)
-    load, soc, error_v = _evaluated(load, soc, error_v, from_s)
+    error_v = clean.voltage_v - ocv_of_each(soc, *grid) + overpotential(cell, clean, soc)
+    clean, soc, error_v = _select_evaluated(clean, soc, error_v, from_s)
     above = soc > LOW_SOC
-    resting = np.abs(load.current_a) < REST_C_RATE * cell.cell.capacity_ah
-    current_a = load.current_a[above]
+    resting = np.abs(clean.current_a) < REST_C_RATE * cell.cell.capacity_ah
+    current_a = clean.current_a[above]
     extra_ohm = -float(error_v[above] @ current_a) / max(float(current_a @ current_a), 1e-12)
-    measured_from = FIRST_REST if load.resting_samples else UNDER_LOAD
+    measured_from = FIRST_REST if clean.resting_samples else UNDER_LOAD
     return Validation(
-        samples=load.samples,
-        glitches=load.glitches,
+        samples=clean.samples,
+        glitches=clean.glitches,
         initial_soc=start,
         initial_soc_from=measured_from if initial_soc is None else GIVEN,
         final_soc=float(soc[-1]),
-        all=_errors(error_v, load.voltage_v),
-        above=_errors(error_v[above], load.voltage_v[above]),
-        resting=_errors(error_v[above & resting], load.voltage_v[above & resting]),
-        loaded=_errors(error_v[above & ~resting], load.voltage_v[above & ~resting]),
+        all=_errors(error_v, clean.voltage_v),
+        above=_errors(error_v[above], clean.voltage_v[above]),
+        resting=_errors(error_v[above & resting], clean.voltage_v[above & resting]),
+        loaded=_errors(error_v[above & ~resting], clean.voltage_v[above & ~resting]),
         extra_ohm=extra_ohm,
-        with_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, load.voltage_v[above]),
+        with_extra_ohm=_errors(error_v[above] + extra_ohm * current_a, clean.voltage_v[above]),
         warnings=tuple(warnings),
-        time_s=load.time_s,
-        current_a=load.current_a,
-        voltage_v=load.voltage_v,
-        temperature_c=load.temperature_c,
+        time_s=clean.time_s,
+        current_a=clean.current_a,
+        voltage_v=clean.voltage_v,
+        temperature_c=clean.temperature_c,
         error_v=error_v,
         soc=soc,
     )
 
 
-def _evaluated(load: CleanCapture, soc: Floats, error_v: Floats, from_s: float) -> tuple[CleanCapture, Floats, Floats]:
-    """Return the samples from the time ``from_s`` on whose voltage belongs to their current."""
-    chosen = (load.time_s >= from_s) & ~load.mismatched
+def _select_evaluated(
+    clean: CleanCapture, soc: Floats, error_v: Floats, from_s: float
+) -> tuple[CleanCapture, Floats, Floats]:
+    """Return the samples after ``from_s`` whose voltage belongs to their current."""
+    chosen = (clean.time_s >= from_s) & ~clean.mismatched
     if chosen.all():  # no copy, because a long capture is large
-        return load, soc, error_v
+        return clean, soc, error_v
     names = ("time_s", "current_a", "voltage_v", "temperature_c", "discharged_ah", "mismatched")
-    return replace(load, **{name: getattr(load, name)[chosen] for name in names}), soc[chosen], error_v[chosen]
+    return replace(clean, **{name: getattr(clean, name)[chosen] for name in names}), soc[chosen], error_v[chosen]
 
 
 def _errors(error_v: Floats, voltage_v: Floats) -> Errors:

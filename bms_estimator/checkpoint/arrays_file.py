@@ -1,6 +1,6 @@
-"""Files of arrays beside the checkpoint of the same pack, and the identities by which both belong to a pack.
+"""Files of a pack's arrays, saved beside its checkpoint: the history with its last fit, and the observed load.
 
-The files have the history with its last fit, and the observed load.
+Hashes of settings and cell data identify the pack to which a file belongs.
 """
 
 import contextlib
@@ -60,7 +60,7 @@ class RejectedFileError(Exception):
 
 
 @contextlib.contextmanager
-def damage_rejected() -> Iterator[None]:
+def reject_damaged() -> Iterator[None]:
     """Convert any exception of a damaged file to a ``RejectedFileError``. A missing file raises a ``FileNotFoundError``."""
     try:
         yield
@@ -111,7 +111,7 @@ class ArraysFile:
     def __init__(self, folder: Path, settings: Settings, cell: PackModel, suffix: str) -> None:
         self._suffix = suffix
         self._name, self._identity = settings.pack.name, pack_identity(settings, cell)
-        self._is_later = False
+        self._is_later = False  # the file has a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}{suffix}"
 
     def save(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -131,7 +131,7 @@ class ArraysFile:
         """
         self._is_later = False
         try:
-            with damage_rejected():
+            with reject_damaged():
                 arrays = read_arrays(self.path, MAX_FILE_BYTES)
                 version, identity = int(arrays.pop("format")), str(arrays.pop("identity"))
         except FileNotFoundError:

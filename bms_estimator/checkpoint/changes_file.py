@@ -24,21 +24,21 @@ from bms_estimator.process.private_file import read_private, write_private
 CHANGES_SUFFIXES = ".changes-0", ".changes-1"
 """Suffixes of the two files."""
 BLOCK_BYTES = 4096
-"""Size of a file [bytes], a block of ext4. With up to five hypotheses the changes have 2 to 3.5 kB. More do not fit, and the
+"""Size of a file [bytes], a block of ext4. Changes of up to five hypotheses take 2 to 3.5 kB. If they do not fit, the whole
 checkpoint is saved."""
 MAX_BASE_AGE_S = 300.0
-"""Maximum age of the checkpoint whose changes are saved [s]. A kill loses what the omitted fields learned since."""
+"""Maximum age of the checkpoint whose changes are saved [s]. A kill loses what the omitted fields have learned since then."""
 MAX_SOC_CHANGE = 0.1
 """Maximum change of the SOC since the checkpoint. The covariances depend on the slope of the OCV at the SOC."""
 MAX_STD_RATIO = 1.1
-"""Maximum growth of the SOC's std since the checkpoint. A restart has the std of the checkpoint, which would be too small."""
+"""Maximum growth of the SOC's std since the checkpoint. A restart uses the checkpoint's covariance, which would be too small."""
 ZLIB_LEVEL = 9
 """Compression level. Level 6 makes the file 1 % larger."""
 
 log = structlog.get_logger(__name__)
 
 
-class Base(NamedTuple):
+class BaseCheckpoint(NamedTuple):
     """Saved checkpoint to which changes refer."""
 
     token: str
@@ -66,10 +66,10 @@ class ChangesFile:
 
     def __init__(self, checkpoint: Path) -> None:
         self._paths = [checkpoint.with_suffix(suffix) for suffix in CHANGES_SUFFIXES]
-        self._base: Base | None = None
+        self._base: BaseCheckpoint | None = None
         self._saves = 0
 
-    def set_base(self, base: Base) -> None:
+    def set_base(self, base: BaseCheckpoint) -> None:
         """Set the checkpoint to which the next changes refer. Its token makes the present files invalid."""
         self._base = base
 
@@ -101,7 +101,7 @@ class ChangesFile:
         return True
 
     def load(self, token: str, dtype: np.dtype[Any]) -> Changes | None:
-        """Read the newest changes since a checkpoint; None without any. A damaged file is logged and ignored.
+        """Read the newest changes since a checkpoint; None if there are none. A damaged file is logged and ignored.
 
         Args:
             token: Identifier of the checkpoint.
@@ -141,7 +141,7 @@ def _overwrite(path: Path, block: bytes) -> None:
 
 
 def _is_small_change(
-    base: Base, state: NDArray[np.void], curves: Mapping[str, NDArray[Any]], now: BootTimestamp
+    base: BaseCheckpoint, state: NDArray[np.void], curves: Mapping[str, NDArray[Any]], now: BootTimestamp
 ) -> bool:
     """Return True if the omitted fields of a recent checkpoint are still valid with the other fields of ``state``."""
     if not 0.0 <= now.since(base.saved) < MAX_BASE_AGE_S:

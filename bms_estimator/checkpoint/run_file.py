@@ -1,4 +1,4 @@
-"""File with counters and alarms of a pack. It is named by the pack only, so that no edited setting loses them.
+"""File with counters and alarms of a pack. Its name contains only the pack's name, so that it survives edited settings.
 
 A checksum in its first line reveals any damage. Other files use the same checksum.
 """
@@ -84,7 +84,7 @@ class SavedRun(NamedTuple):
     counters: RunCounters
     """Counters including this start."""
     lost_reason: str = ""
-    """Reason for which raised alarms may be missing; empty if the alarms are complete."""
+    """Reason why raised alarms may be missing; empty if the alarms are complete."""
     is_damaged: bool = False
     """True if there is a file that cannot be used."""
     crashed: bool = False
@@ -103,7 +103,7 @@ class RunFile:
     def __init__(self, folder: Path, name: str, wall_s: Callable[[], float]) -> None:
         self._name, self._wall_s = name, wall_s
         self.path = folder / f"{name}.run"
-        self._refused = folder / f"{name}.refused.run"
+        self._quarantined = folder / f"{name}.refused.run"
 
     def save(self, counters: RunCounters) -> None:
         """Write the file atomically, or overwrite it on a full disk or in a read-only folder. A missing folder is created.
@@ -117,7 +117,7 @@ class RunFile:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             write_private(self.path, content)
         except OSError:
-            # a raised alarm must not wait for free space; a power failure meanwhile damages the file, which is the safe side
+            # a raised alarm must not wait for free space; the next start reports a file that a power failure has damaged
             overwrite_private(self.path, content)
 
     def load(self) -> SavedRun:
@@ -127,33 +127,33 @@ class RunFile:
             if (name := values.get("name", self._name)) != self._name:
                 raise ValueError(f"it belongs to the pack {name}")  # noqa: TRY301 - one handler
             crashed = values.get("clean") is not True
-            return SavedRun(self._next_counters(values), self._newer_former(), crashed=crashed)
+            return SavedRun(self._next_counters(values), self._newer_checkpoint_reason(), crashed=crashed)
         except FileNotFoundError:
-            return self._load_former()
+            return self._load_former_version()
         except Exception as error:  # noqa: BLE001 - a damaged file may raise anything, and is reported
-            former = self._load_former().counters
+            former = self._load_former_version().counters
             return SavedRun(former, f"{self.path.name} is damaged ({error})", is_damaged=True)
 
     def quarantine(self) -> str:
         """Rename a damaged file, so that the next save does not overwrite it. Return a description for the user."""
         try:
-            self.path.replace(self._refused)
+            self.path.replace(self._quarantined)
         except OSError as error:
             return f"it cannot be set aside: {error}"
-        return f"set aside as {self._refused.name}"
+        return f"set aside as {self._quarantined.name}"
 
-    def _load_former(self) -> SavedRun:
+    def _load_former_version(self) -> SavedRun:
         """Return the counters of the pack's newest readable checkpoint of a former version, whatever its identity."""
         former, lost_reason = None, ""
         for path in self._checkpoints():
             try:
-                values = _former_counters(path)
+                values = _read_former_counters(path)
             except Exception as error:  # noqa: BLE001 - a damaged file may raise anything; an older one may be readable
-                if former is None or isinstance(error, KeyError):  # a checkpoint without counters was beside the file
+                if former is None or isinstance(error, KeyError):  # a checkpoint without counters had a run file
                     lost_reason = f"{self.path.name} is missing, and {path.name} has no readable alarms"
             else:
                 former = former or values
-        if not lost_reason and (self._refused.exists() if former else self._has_other_files()):
+        if not lost_reason and (self._quarantined.exists() if former else self._has_other_files()):
             lost_reason = f"{self.path.name} is missing beside other files of the pack"
         if not former and not lost_reason:
             lost_reason = self._other_pack_with_alarm()
@@ -161,13 +161,13 @@ class RunFile:
             return SavedRun(self._next_counters(former), lost_reason)
         return SavedRun(RunCounters(int(bool(lost_reason)), new_totals(self._wall_s())), lost_reason)
 
-    def _newer_former(self) -> str:
-        """Return a reason if a former version, which does not know this file, has saved alarms after it; otherwise an empty text."""
+    def _newer_checkpoint_reason(self) -> str:
+        """Return a reason if a version without run files has saved alarms later than this file; otherwise an empty text."""
         saved_ns = self.path.stat().st_mtime_ns
         for path in self._checkpoints():
             if path.lstat().st_mtime_ns > saved_ns:
                 with contextlib.suppress(Exception):  # the content of a damaged file does not count
-                    _former_counters(path)
+                    _read_former_counters(path)
                     return f"{path.name} of a former version is newer than {self.path.name}"
         return ""
 
@@ -179,13 +179,13 @@ class RunFile:
 
     def _has_other_files(self) -> bool:
         """Return True if an earlier run has left any other file."""
-        # another pack may have a name like this one's with an identity, but no file of both kinds has the same suffix
+        # the name of another pack may be this pack's name with an identity; then only the suffix shows whose file it is
         suffixes = r"\.((refused|later).*|sqlite.*|board\.json|new)|-[0-9a-f]{8}\.(((history|load)\.)?npz|changes-\d)"
         pattern = re.compile(rf"{re.escape(self._name)}({suffixes})")
         return any(pattern.fullmatch(path.name) for path in self._folder_content())
 
     def _other_pack_with_alarm(self) -> str:
-        """Return a reason if another pack has a raised or due critical alarm or a lost sensor: this one may be that pack, renamed.
+        """Return a reason if another pack, which this one may be after a renaming, has a critical alarm or a lost sensor.
 
         A pack that is served at present has not been renamed.
         """
@@ -252,7 +252,7 @@ def _are_slots(slots: Any) -> TypeGuard[list[int]]:
     return slots == sorted(set(slots))
 
 
-def _former_counters(path: Path) -> dict[str, Any]:
+def _read_former_counters(path: Path) -> dict[str, Any]:
     """Return the counters and alarms in a checkpoint of a former version.
 
     Raises:

@@ -24,22 +24,22 @@ from bms_estimator.checkpoint.arrays_file import (
     LOAD_SUFFIX,
     ArraysFile,
     RejectedFileError,
-    damage_rejected,
     observer_identity,
     pack_identity,
     read_arrays,
+    reject_damaged,
     set_aside,
     without_observer,
     write_arrays,
 )
-from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, Base, ChangesFile
+from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, BaseCheckpoint, ChangesFile
 from bms_estimator.checkpoint.run_file import RunFile, SavedRun
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
-from bms_estimator.pack.state import CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, Declared, PackState
+from bms_estimator.pack.state import CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, DeclaredValues, PackState
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
 from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.settings.pack import Settings
@@ -78,7 +78,7 @@ class CheckpointFile:
     ) -> None:
         self._name, self._now = settings.pack.name, now
         self._identity, self._observer = pack_identity(settings, cell), observer_identity(settings, cell)
-        self._declared = Declared.by(cell)
+        self._declared = DeclaredValues.of(cell)
         self._longest_days = settings.state.longest_days
         self._is_later = False  # the file has a later format
         self.path = folder / f"{self._name}-{self._identity[:8]}.npz"
@@ -126,13 +126,13 @@ class CheckpointFile:
         content |= {f"{_CURVES}{name}": array for name, array in curves.items()}
         content |= {f"{_CELLS}{name}": array for name, array in (cells or {}).items()}
         write_arrays(self.path, content)
-        self._changes.set_base(Base(token, state.copy(), curves, now))
+        self._changes.set_base(BaseCheckpoint(token, state.copy(), curves, now))
         self._remove_oldest()
 
     def load(self) -> PackState:
         """Read the state of estimator and single cells. An error is returned in the result's ``reasons``."""
         try:
-            with damage_rejected():
+            with reject_damaged():
                 return self._validate(read_arrays(self.path, MAX_FILE_BYTES))
         except FileNotFoundError:
             return PackState(reasons={CHECKPOINT: "none found"})
@@ -145,12 +145,12 @@ class CheckpointFile:
         paths = [self.path, *(self.path.with_suffix(suffix) for suffix in CHANGES_SUFFIXES)]
         return max((path.lstat().st_mtime_ns for path in paths if path.exists()), default=0)
 
-    def other_declared(self) -> Iterator[tuple[Path, Declared]]:
+    def other_declared(self) -> Iterator[tuple[Path, DeclaredValues]]:
         """Yield the pack's other checkpoints with a declared capacity. Damaged files are ignored."""
         for path in self._other_paths():
             with contextlib.suppress(Exception):  # a damaged file may raise anything
                 file = read_arrays(path, MAX_FILE_BYTES)
-                declared = Declared(*(float(file[name]) for name in Declared._fields))
+                declared = DeclaredValues(*(float(file[name]) for name in DeclaredValues._fields))
                 if all(0.0 < value < math.inf for value in declared):
                     yield path, declared
 
@@ -159,7 +159,7 @@ class CheckpointFile:
 
         A file of a later format is valid. It gets a separate name, so that the later version can use it after a
         re-upgrade. The user must rename it back: it is not loaded automatically, because this version meanwhile writes
-        newer files, although these may contain less learning.
+        newer files.
         """
         quarantined = self.path.with_name(f"{self._name}.refused.npz")
         if self._is_later:
@@ -232,7 +232,7 @@ class SavedPack(NamedTuple):
     age_s: float | None = None
     """Time since the save [s]; infinite if unknown; None: the pack was not saved, but is at the end of a capture."""
     load_reason: str = ""
-    """Reason for which the observed load is unknown; empty if it was restored or none was saved."""
+    """Reason why the observed load is unknown; empty if it was restored or none was saved."""
 
 
 class StateFiles:
@@ -263,7 +263,7 @@ class StateFiles:
         self.thread = DaemonThreadExecutor("checkpoint")
 
     def newest(self) -> "StateFiles":
-        """Return the files of the pack's last run, whose declared capacity may be another one; without any, these files."""
+        """Return the files of the pack's last run, perhaps with another declared capacity. Without any, return these files."""
         newest = self
         if isinstance(self._model, CellModel):
             for path, declared in self.checkpoint.other_declared():
@@ -323,8 +323,8 @@ class StateFiles:
             )
         outcomes = {**state.reasons, **pack.restore(state, 0.0)}
         refused = {name: outcome for name, outcome in outcomes.items() if outcome.startswith(REFUSED)}
-        off = "" if pack.estimator.record[0]["filter"]["started"] else "the identifier was off"
-        if reason := refused.get(CURVES) or refused.get(CHECKPOINT) or off:
+        not_identified = "" if pack.estimator.record[0]["filter"]["started"] else "the identifier was off"
+        if reason := refused.get(CURVES) or refused.get(CHECKPOINT) or not_identified:
             raise UserError(f"{path}: nothing was learned: {reason}")
         return SavedPack(self._settings.pack.name, pack, state.gap_s, refused.get(LOAD, "").removeprefix(REFUSED))
 

@@ -19,11 +19,11 @@ class ReadyBlock(NamedTuple):
     """Wall clock [s since 1970]."""
     samples: SampleBlock
     cells_v: CellBlock = NO_CELLS
-    """Cell voltages of the samples, shape (n, m) [V]; empty without any."""
+    """Cell voltages of the samples, shape (n, m) [V]; empty if there are none."""
 
 
 class Batcher:
-    """Divides samples into blocks of equal duration.
+    """Divider of samples into blocks of equal duration.
 
     Args:
         block_s: Minimum time from the first sample of a block to that of the next one [s].
@@ -33,9 +33,8 @@ class Batcher:
     def __init__(self, block_s: float, max_samples: int = MAX_SAMPLES) -> None:
         self._block_s, self._max_samples = block_s, max_samples
         self._parts: list[SampleBlock] = []
-        self._cell_parts: list[
-            CellBlock
-        ] = []  # cell voltages of the same samples; the number of cells may differ between parts
+        # cell voltages of the same samples; the number of cells may differ between parts
+        self._cell_parts: list[CellBlock] = []
         self._count, self._arrival_s = 0, 0.0  # samples in the open block, and arrival of the last one
         self._end_s = 0.0  # sample time at which the open block ends
 

@@ -40,8 +40,8 @@ VERSION = 3
 """Newest version of the format that this program reads."""
 _VERSION_WITHOUT_CELLS, _VERSION_WITH_CELLS, _VERSION_WITH_PROBES = 1, 2, 3
 MAX_PROBE_SAMPLES = 4_000
-"""Maximum number of samples of a block of version 3. At 52 bytes for each incompressible sample, the block stays below the server's
-limit. A longer block contains only the mean temperature."""
+"""Maximum number of samples of a block of version 3. At 52 bytes for each incompressible sample, the block stays below the
+server's limit. A longer block contains only the mean temperature."""
 MAX_SAMPLES = 65_535
 """Maximum number of samples of a block."""
 MAX_NUMBER = 2**63
@@ -79,7 +79,7 @@ class Block(BlockHeader):
 
     Attributes:
         samples: Shape (n,), dtype ``SAMPLE``, 1 to ``MAX_SAMPLES`` of them.
-        cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
+        cells_v: Cell voltages of the samples, shape (n, m) [V]; empty if there are none.
     """
 
     samples: SampleBlock

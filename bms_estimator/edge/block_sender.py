@@ -1,7 +1,7 @@
 """Sender of a pack's raw samples to a fleet's server, by MQTT, in blocks.
 
 ``BlockSender`` collects samples in blocks, sends the blocks and receives the workers' confirmations. ``BlockStore``
-stores blocks until a worker has confirmed them. Package ``mqtt`` connects to the server and reconnects. ``SampleClock`` maps the clock of a source to a clock that never steps back.
+stores blocks until a worker has confirmed them. ``SampleClock`` converts the times of a source to a clock that never steps back.
 """
 
 import asyncio
@@ -62,7 +62,7 @@ class SampleClock:
     without the time; the step becomes a gap. The clock ignores a wall clock that is set back.
 
     Args:
-        last_s: Time of the last sample of an earlier run [s since 1970]; minus infinity without one.
+        last_s: Time of the last sample of an earlier run [s since 1970]; minus infinity without an earlier run.
 
     Attributes:
         steps: Number of times that a clock was set or the source started.
@@ -133,7 +133,7 @@ class SampleClock:
 
     def _update_drift(self, delay_s: float, now_s: float) -> None:
         """Schedule a correction if the source's clock runs ahead or falls behind."""
-        if delay_s < -DEAD_BAND_S:  # a sample from the future is proof at once, because transport only delays
+        if delay_s < -DEAD_BAND_S:  # one sample from the future is proof, because transport only delays
             self._slew_s = delay_s
         self._min_delay_s = min(self._min_delay_s, delay_s)
         if now_s - self._window_s < WINDOW_S:
@@ -148,7 +148,7 @@ class SampleClock:
 
 
 def _fill_non_finite(source_s: Times, previous_s: float) -> Times:
-    """Replace each non-finite time by the previous time, or by 0 without one."""
+    """Replace each non-finite time by the previous time, or by 0 at the start."""
     if np.isfinite(source_s).all():
         return source_s
     filled = source_s.copy()
@@ -161,7 +161,7 @@ MIB = 1 << 20
 """Mebibyte [bytes]."""
 MAX_BLOCK_AGE = 1.5
 """Age at which an incomplete block is sent, as a multiple of the block duration."""
-HANDOVER_S = 2.0
+FINAL_SEND_TIMEOUT_S = 2.0
 """Time limit for sending the remaining blocks at shutdown [s]."""
 MAX_RECONNECT_DELAY_S = 120.0
 """Maximum delay before a reconnect [s]. Delays have a mean of three quarters of it, so that 100,000 edges make 1,100
@@ -173,7 +173,7 @@ log = structlog.get_logger(__name__)
 
 
 class BlockSender:
-    """Sends samples of one pack.
+    """Sender of the samples of one pack.
 
     Args:
         settings: Destination and storage of the blocks.
@@ -185,7 +185,7 @@ class BlockSender:
         max_samples: Maximum number of samples of a block.
         first_delay_s: Delay after a lost connection or a temporary rejection [s].
         retry_s: Delay before a failed disk is retried [s].
-        handover_s: Time limit for sending the remaining blocks at shutdown [s].
+        final_send_timeout_s: Time limit for sending the remaining blocks at shutdown [s].
 
     Attributes:
         delivery: Delivery statistics of the blocks.
@@ -207,9 +207,9 @@ class BlockSender:
         max_samples: int = MAX_SAMPLES,
         first_delay_s: float = FIRST_DELAY_S,
         retry_s: float = RETRY_S,
-        handover_s: float = HANDOVER_S,
+        final_send_timeout_s: float = FINAL_SEND_TIMEOUT_S,
     ) -> None:
-        self._clock, self._steady, self._handover_s = clock or Clock(), steady, handover_s
+        self._clock, self._steady, self._final_send_timeout_s = clock or Clock(), steady, final_send_timeout_s
         self._block_s, self._batcher = settings.block_s, Batcher(settings.block_s, max_samples)
         self._sends_cells = settings.cells
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
@@ -242,7 +242,7 @@ class BlockSender:
 
         Args:
             samples: Samples, shape (n,).
-            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any. They are sent only with the setting
+            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty if there are none. They are sent only with the setting
                 ``cells``.
         """
         if self._sample_clock is None:
@@ -280,11 +280,11 @@ class BlockSender:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Complete the open block, and send blocks for at most ``handover_s``. The next run sends the remaining blocks."""
+        """Complete the open block, and send blocks for at most ``final_send_timeout_s``. The next run sends the others."""
         self._end_block()
         if self._task is not None:
             self._link.closing.set()
-            await finish(self._task, self._handover_s + DISCONNECT_TIMEOUT_S)
+            await finish(self._task, self._final_send_timeout_s + DISCONNECT_TIMEOUT_S)
         await self._stack.aclose()
 
     def _watch_open_block(self) -> None:
@@ -314,7 +314,7 @@ class BlockSender:
                 ]
                 await self._link.closing.wait()
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(self._handover_s):
+                    async with asyncio.timeout(self._final_send_timeout_s):
                         await self._sender.wait_until_empty()
                 for task in transfers:
                     task.cancel()

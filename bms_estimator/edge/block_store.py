@@ -35,7 +35,7 @@ log = structlog.get_logger(__name__)
 
 
 class BlockStore:
-    """Stores blocks in order until a worker has confirmed them; implements ``mqtt.queue_sender.MessageQueue``.
+    """Store of blocks, in order, until a worker has confirmed them; implements ``mqtt.queue_sender.MessageQueue``.
 
     Args:
         database: Database with ``EDGE_TABLES``, synced at each transaction; its owner opens and closes it.
@@ -137,15 +137,15 @@ class BlockStore:
         if request.resend:
             self._resend(request.number)
 
-    async def take(self, most: int) -> list[QueuedMessage]:
-        """Wait for a block, then return up to ``most`` consecutive ones."""
+    async def take(self, max_count: int) -> list[QueuedMessage]:
+        """Wait for a block, then return up to ``max_count`` consecutive ones."""
         while True:
             while self._on_disk is None or self._cursor >= self._on_disk.state.next_number:
                 self._block_ready.clear()
                 await self._block_ready.wait()
             created_s, first = self._on_disk.state.created_s, self._cursor
             try:
-                page = await self._database.call(PageRead(created_s, first, self._on_disk.state.next_number, most))
+                page = await self._database.call(PageRead(created_s, first, self._on_disk.state.next_number, max_count))
             except StoreError:
                 await asyncio.sleep(RETRY_S)
                 continue

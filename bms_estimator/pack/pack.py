@@ -1,4 +1,4 @@
-"""One pack as one object: the only place that assembles its stages and runs them in their order."""
+"""Pack with all its stages. Only this module assembles the stages and decides their order."""
 
 import math
 from collections.abc import Callable
@@ -30,13 +30,13 @@ from bms_estimator.pack.state import (
     HISTORY,
     LOAD,
     REFUSED,
-    Declared,
+    DeclaredValues,
     PackState,
 )
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import use_fitted_curves
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.saved import fit_of_curves, history_of
+from bms_estimator.pack_model.saved import fit_from_arrays, history_from_arrays
 from bms_estimator.pack_model.slow_fit import FIT_INTERVAL_S, SlowFit, Submit, run_now
 from bms_estimator.settings.pack import Settings
 
@@ -46,13 +46,13 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Step:
+class RunResult:
     """Result of a block of samples. The arrays are valid until the next block."""
 
     trace: TraceBlock
     """Estimates, one row of dtype ``TRACE`` for each accepted sample."""
     forecast_parts: tuple[tuple[ForecastRows, int], ...]
-    """Values of the forecasts, and the number of rows from which on each of them was the latest; empty without forecasts."""
+    """Values of each forecast, and the number of rows at which it was the latest; empty without forecasts."""
 
     @property
     def forecasts(self) -> ForecastRows:
@@ -62,14 +62,14 @@ class Step:
 
 
 class Pack:
-    """Estimator of a pack with its other stages. It owns the time: it runs each stage, and no stage runs another.
+    """Estimator of a pack with its other stages. It alone decides when a stage runs; no stage runs another.
 
     Any division of the samples into blocks gives the same results to the last bit.
 
     Args:
         estimator: Estimator of the pack.
-        slow_fit: Fit of the pack's model to its history; None: none.
-        cells: Estimators of the single cells; None: none.
+        slow_fit: Fit of the pack's model to its history; None: no slow fit.
+        cells: Estimators of the single cells; None: single cells are not estimated.
         forecaster: Forecaster; None: there are no forecasts.
         has_forecasts: False: the observed load is kept, but no forecasts are made at intervals.
         device_soc_std: Std of the SOC that the device reports, which is the prior of a new pack; None: it is not used.
@@ -97,7 +97,7 @@ class Pack:
         """Model of the whole pack."""
         return self.estimator.cell
 
-    def waited(self, wait_s: float) -> None:
+    def extend_gap(self, wait_s: float) -> None:
         """Extend the gap before the first accepted sample after ``restore``. Later calls have no effect.
 
         Args:
@@ -109,13 +109,13 @@ class Pack:
             if self.cells:
                 self.cells.extend_gap(wait_s)
 
-    def run(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS, device_soc: Floats = NO_SOC) -> Step:
+    def run(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS, device_soc: Floats = NO_SOC) -> RunResult:
         """Process a block of samples.
 
         Args:
             samples: Samples, shape (n,), dtype ``SAMPLE``.
-            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty without any.
-            device_soc: SOC by the device at the samples, 0..1, shape (n,); empty without any.
+            cells_v: Cell voltages of the samples, shape (n, m) [V]; empty if there are none.
+            device_soc: SOC that the device reports at the samples, 0..1, shape (n,); empty if there are none.
         """
         self._has_cells = cells_v.size > 0 or (self.cells is not None and self.cells.cells.size > 0)
         if self._trace.size < samples.size:
@@ -128,7 +128,7 @@ class Pack:
             if forecaster:
                 forecaster.add(self._trace[begin:rows], self.cells.deviations if self.cells else None)
             if forecaster and self._has_forecasts:
-                # a due sample that is rejected marks the last accepted row
+                # if the due sample was rejected, the new forecast applies from the last accepted row
                 before = rows - begin if due is None else max(rows - begin - 1, 0)
                 forecasts.append((forecaster.latest.values, before))
                 if due is not None:
@@ -137,7 +137,7 @@ class Pack:
             start = end
         if forecaster and not self._has_forecasts:
             forecaster.past.add(forecaster.load)
-        return Step(self._trace[:rows], tuple(forecasts))
+        return RunResult(self._trace[:rows], tuple(forecasts))
 
     def _run_estimates(self, samples: SampleBlock, cells_v: CellBlock, device_soc: Floats, rows: int) -> int:
         """Run estimator, single cells and slow fit. Append the estimates to the trace, and return its new length.
@@ -150,7 +150,7 @@ class Pack:
             stop = samples.size if prior is None else start + prior + 1
             used, written = self.estimator.run_part(samples[start:stop], self._trace[rows:])
             end, trace = start + used, self._trace[rows : rows + written]
-            if self._has_cells and self.cells:  # the call would take a tenth of the time of a single sample
+            if self._has_cells and self.cells:  # without cells, the call takes a tenth of a sample's time
                 self.cells.run(samples[start:end], cells_v[start:end], trace)
             if self.slow_fit:
                 self.slow_fit.advance()
@@ -161,7 +161,7 @@ class Pack:
         return rows
 
     def _prior_index(self, samples: SampleBlock, device_soc: Floats) -> int | None:
-        """Return the index of the first sample of a new pack with an SOC by the device; None if no prior is due."""
+        """Return the index of the first sample of a new pack with an SOC that the device reports; None if no prior is due."""
         if self._device_soc_std is None:
             return None
         self._first_s = float(samples["time_s"][0]) if math.isnan(self._first_s) else self._first_s
@@ -187,9 +187,11 @@ class Pack:
         """
         outcomes: dict[str, str] = {}
         state = self._with_present_capacity(state, outcomes)
-        curves = _converted(CURVES, lambda: fit_of_curves(state.curves), outcomes)
+        curves = _try_convert(CURVES, lambda: fit_from_arrays(state.curves), outcomes)
         if self.slow_fit:
-            saved = _converted(HISTORY, lambda: history_of(state.history), outcomes) if state.history else None
+            saved = (
+                _try_convert(HISTORY, lambda: history_from_arrays(state.history), outcomes) if state.history else None
+            )
             self.slow_fit.load(*(saved or (History(), None)), curves)
         elif curves:
             use_fitted_curves(self.estimator, curves)
@@ -209,17 +211,17 @@ class Pack:
         if forecaster := self.forecaster:
             forecaster.deviations = self.cells.deviations if self.cells else None
             if state.load:
-                _converted(LOAD, lambda: restore_load(forecaster.load, forecaster.past, state.load), outcomes)
+                _try_convert(LOAD, lambda: restore_load(forecaster.load, forecaster.past, state.load), outcomes)
                 outcomes.setdefault(LOAD, f"restored: {forecaster.load.seconds} s")
         return outcomes
 
     def _with_present_capacity(self, state: PackState, outcomes: dict[str, str]) -> PackState:
         """Return a state relative to the present declared capacity; without a record if it cannot be converted."""
-        before, declared = state.declared, Declared.by(self.model)
+        before, declared = state.declared, DeclaredValues.of(self.model)
         if before is None or declared is None or before == declared:
             return state
         p = self.estimator.cell_file_settings
-        converted = _converted(CHECKPOINT, lambda: with_capacity(state, before, declared, p), outcomes)
+        converted = _try_convert(CHECKPOINT, lambda: with_capacity(state, before, declared, p), outcomes)
         if converted is None:
             return PackState(load=state.load, reasons=outcomes)
         outcomes[CAPACITY] = (
@@ -255,7 +257,7 @@ class Pack:
             slow_fit.resume(gap_s, restored=restored)
 
 
-def _converted(name: str, convert: Callable[[], T], outcomes: dict[str, str]) -> T | None:
+def _try_convert(name: str, convert: Callable[[], T], outcomes: dict[str, str]) -> T | None:
     """Return the result of ``convert``; None with an outcome if the arrays of a part are damaged."""
     try:
         return convert()
@@ -283,7 +285,7 @@ def new_pack(
     Args:
         settings: The pack's settings.
         model: Model of the whole pack.
-        submit: Runs a fit; default: at once, and the samples wait for it.
+        submit: Runs a fit. By default the fit runs at once, and the samples wait for it.
         on_failure: Called with the exception of a failed fit.
         has_forecasts: False: no forecasts at intervals.
 

@@ -11,20 +11,20 @@ from bms_estimator.model.pack_model import PackModel
 
 Arrays = Mapping[str, NDArray[Any]]
 REFUSED = "refused: "
-"""Prefix of the reason for which a part was refused."""
+"""Prefix of the reason why a part was refused."""
 CHECKPOINT, CURVES, CELLS, HISTORY, LOAD, CAPACITY = "checkpoint", "curves", "cells", "history", "load", "capacity"
 """Names of the parts in outcomes."""
 
 
-class Declared(NamedTuple):
+class DeclaredValues(NamedTuple):
     """Values of a battery's model to which learned values are relative."""
 
     capacity_ah: float
     r_s_ohm: float
 
     @classmethod
-    def by(cls, model: PackModel) -> "Declared | None":
-        """Return the values of a model; None for a fuel cell."""
+    def of(cls, model: PackModel) -> "DeclaredValues | None":
+        """Return the declared values of a model; None for a fuel cell."""
         return model.by_kind(lambda cell: cls(cell.capacity_ah, cell.r_s.offset_ohm), lambda _: None)
 
 
@@ -45,7 +45,7 @@ class PackState:
     """Observed load (``forecast.saved_load.load_arrays``)."""
     gap_s: float = math.inf
     """Time since ``record`` was saved [s]; infinite if unknown."""
-    declared: Declared | None = None
+    declared: DeclaredValues | None = None
     """Declared values of the pack at the save; None: the present ones."""
     reasons: Mapping[str, str] = field(default_factory=dict)
-    """Reason for which a part is empty, by its name; it begins with ``REFUSED`` if the part exists."""
+    """Reason why a part is empty, by its name; it begins with ``REFUSED`` if the part exists."""

@@ -1,13 +1,13 @@
-"""Lower bound of the std of the SOC: the std that voltages leave after infinite time, and changes that lower it.
+"""Lower bound of the std of the SOC, which remains after infinite time, and changes of use or sensors that lower it.
 
-A pack passes a window of SOC again and again. Every error that differs from pass to pass averages out. What remains is the
+A pack passes a window of SOC repeatedly. Every error that differs from pass to pass averages out. What remains is the
 error of the cell file's OCV curve, and an error by direction (charge, discharge, rest) that recurs at each pass. The
 unknowns are the SOC, the capacity, the hysteresis and the curve, with the priors of the slow fit. The model is linear in
 small deviations:
 
     voltage error = slope (dSOC + (SOC - middle) d ln Q) + hysteresis + curve + error by direction
 
-This std is a lower bound: no estimator that knows no more than the cell file can have a smaller error on average over the
+This std is a lower bound: no estimator with only the information of the cell file has a smaller error on average over the
 possible cells and over the window. At single SOCs, as near full, the std may be smaller than this mean. Resistances are left
 out, because rests separate them: with their prior and currents of 0.4 C the std changes by less than 0.01 %.
 """
@@ -33,7 +33,8 @@ from bms_estimator.pack_model.prior import (
 )
 
 DISCHARGE_C = 0.4
-"""Assumed C-rate of the discharges if charges are not measured. The offset of the current sensor is then an error of the capacity."""
+"""Assumed C-rate of the discharges if charges are not measured. The offset of the current sensor is then an error of the
+capacity."""
 UNMEASURED_K = 10.0
 """Std of the deviation of an unmeasured temperature from 25 C [K], as for ``noise.UNSENSED_R_STD``."""
 LOW_SOC = 0.1
@@ -51,7 +52,7 @@ class Window:
     low: float
     high: float = 0.95
     full: bool = False
-    """True: the end of a charge is seen again and again. The window then ends at SOC 1."""
+    """True: ends of charge are measured repeatedly. The window then ends at SOC 1."""
     charge_seen: bool = True
     """True: charges are measured, too, so that their balance with the discharges shows the offset of the current sensor."""
     has_temperature: bool = True
@@ -86,7 +87,9 @@ class Accuracy:
         covariance[SOC, SOC] = NEW_SEGMENT_STD**2
         covariance[LN_Q, LN_Q] = capacity_std**2 + relative_offset**2
         covariance[HYSTERESIS, HYSTERESIS] = 2.0 * HYSTERESIS_STD**2  # fast and slow part are both saturated
-        curve_v2 = curve_covariance(self.cell, self.soc) + 1e-10 * np.eye(self.soc.size)  # rounding errors
+        curve_v2 = curve_covariance(self.cell, self.soc) + 1e-10 * np.eye(
+            self.soc.size
+        )  # positive definite despite rounding
         if not self.window.has_temperature:
             by_kelvin_v = np.hypot(np.interp(self.soc, SOC_GRID, self.cell.per_kelvin_v), ENTROPY_STD_V)
             curve_v2 += np.outer(UNMEASURED_K * by_kelvin_v, UNMEASURED_K * by_kelvin_v)
@@ -110,14 +113,14 @@ class Accuracy:
         return total
 
     def soc_derivatives(self, soc: Floats) -> Floats:
-        """Return the derivatives of the SOC by the unknowns for each estimated SOC in ``soc``, shape (n, unknowns)."""
+        """Return the derivatives of the SOC with respect to the unknowns, for each estimated ``soc``, shape (n, unknowns)."""
         rows = np.zeros((soc.size, CURVE + self.soc.size))
         rows[:, SOC], rows[:, LN_Q] = 1.0, soc - self.middle
         return rows
 
     @cached_property
     def spectrum(self) -> tuple[Floats, Floats]:
-        """Information in units of the prior, ascending, and the directions that belong to it, as columns."""
+        """Eigenvalues of the information in units of the prior, ascending, and their directions, as columns."""
         root = np.linalg.cholesky(self.prior())
         values, vectors = np.linalg.eigh(root.T @ self.information() @ root)
         return np.maximum(values, 0.0), root @ vectors
@@ -142,7 +145,7 @@ class Accuracy:
 def improvements(cell: CellCurves, window: Window) -> dict[str, float]:
     """Return the lower bound of the std in the present window after each possible change, the lowest first.
 
-    A change that is in force already is left out.
+    Changes that are already in force are omitted.
     """
     stds = {
         name: float(Accuracy(changed_cell, changed).std(window.soc).mean())

@@ -110,17 +110,17 @@ def _ln_values(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
     cell, u, x, n = equations.model.cell, equations.unknowns, minimum.x, equations.intervals.count
     ohm = cell.series * cell.resistances(RESISTANCE_SOC, AT_REFERENCE, AT_REFERENCE)[0]
     group_ohm = np.bincount(RESISTANCE_GROUPS, ohm) * np.exp(x[u.ln_r])
-    ln_r = np.zeros((n, u.size))  # derivatives of what all resistances have in common
+    ln_r = np.zeros((n, u.size))  # derivatives of the common factor of all resistances
     position = NodePosition.of(RESISTANCE_SOC, SHAPE_NODES)
     ln_r[:, u.shape.start + position.below] = position.weights[0]
     ln_r[:, u.shape.start + position.below + 1] = position.weights[1]
     ln_r[:, u.aging] = AgingVariance(RESISTANCE, cell, equations.intervals).trend[:, None]
     common = ln_r @ x
-    select = np.zeros((3 * n, u.size))
-    select[:n, u.ln_q] = np.eye(n)
-    select[n : 2 * n] = select[2 * n :] = ln_r
-    select[n : 2 * n, u.ln_r.start] = 1.0
-    select[2 * n :, u.ln_r] = group_ohm / group_ohm.sum()
+    derivatives = np.zeros((3 * n, u.size))
+    derivatives[:n, u.ln_q] = np.eye(n)
+    derivatives[n : 2 * n] = derivatives[2 * n :] = ln_r
+    derivatives[n : 2 * n, u.ln_r.start] = 1.0
+    derivatives[2 * n :, u.ln_r] = group_ohm / group_ohm.sum()
     ln_ah = x[u.ln_q] + np.log(cell.capacity_as / HOUR_S)
     mean = np.concatenate([ln_ah, common + np.log(group_ohm[0]), common + np.log(group_ohm.sum())])
-    return mean, minimum.covariance_of(select)
+    return mean, minimum.covariance_of(derivatives)

@@ -33,8 +33,8 @@ MIN_ROWS = 4
 PRIOR_ROWS = 4.0
 """Weight of the prior variance of a bin, in rows."""
 REPEAT_STD_V, REPEAT_STD_SOC = 1e-3, 0.003
-"""Prior std of the difference of E_o of the mean cell between two discharges: a voltage error [V] and an SOC error. The std of this
-module are one to four times the values that maximize the likelihood of simulated healthy banks, because a real bank has
+"""Prior std of the difference of E_o of the mean cell between two discharges: a voltage error [V] and an SOC error. The stds in
+this module are one to four times the values that maximize the likelihood of simulated healthy banks, because a real bank has
 further errors."""
 INDEPENDENT_FRACTION = 0.2
 """Fraction of the variance of E_o between discharges that is independent from row to row. The rest is correlated over
@@ -54,8 +54,8 @@ residuals, and must still raise the alarm."""
 SHIFTS, SHRINKS = np.linspace(0.0, 0.4, 21), np.linspace(0.0, 0.6, 25)
 """Tested values of ``shift`` and ``shrink``."""
 SHIFT_STD, SHRINK_STD = 0.03, Noise.cell_spread
-"""Std of the priors of ``shift`` (assumed) and ``shrink``. The prior of ``shrink`` is the cell imbalance that the filter assumes for
-the published ``soc_std``."""
+"""Std of the priors of ``shift`` (assumed) and ``shrink``. The prior of ``shrink`` is the cell imbalance that the filter
+assumes for the published ``soc_std``."""
 MIN_DIFFERENCE_STD = 0.01
 """Minimum std of the difference between the SOCs of the weak cell and of the others, added in quadrature: half the step of
 ``SHIFTS``."""
@@ -93,8 +93,8 @@ class ComparedCell:
     filter_soc: float
     """SOC of the bank at the last row, as estimated by the filter."""
     deviation_std: float
-    """Significance of a weak cell: square root of twice the log-likelihood ratio of a weak cell and no weak cell [std]. The row that
-    supports the weak cell most is left out. The value is 1 or less in most discharges of a healthy bank."""
+    """Significance of a weak cell: square root of twice the log-likelihood ratio of a weak cell and no weak cell [std]. The row
+    that supports the weak cell most is omitted. The value is 1 or less in most discharges of a healthy bank."""
     mean: Floats
     """Mean of ``shift`` and ``shrink``."""
     covariance: Floats
@@ -112,8 +112,8 @@ class ComparedCell:
     def weakest_soc(self, filter_soc: float) -> tuple[float, float]:
         """Return mean and std of the weakest cell's SOC when the filter's SOC of the bank is ``filter_soc``.
 
-        The std is that of the difference from the other cells. It does not contain the std of the filter's SOC. An over-discharged cell has
-        an SOC of 0.
+        The std is that of the difference from the other cells. It does not contain the std of the filter's SOC. An
+        over-discharged cell has an SOC of 0.
         """
         soc = self.others_soc(filter_soc)
         weights = np.array([1.0, 1.0 - soc])

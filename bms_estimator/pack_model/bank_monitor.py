@@ -22,7 +22,7 @@ from bms_estimator.pack_model.history import History, ReferenceDischarges, WeakC
 from bms_estimator.pack_model.open_circuit import drawn_soc, row_soc
 from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_FRACTION, WEAK_CELL_STD
 
-CHARGED_SOC = 0.05
+MIN_CHARGE_SOC = 0.05
 """Charge that ends a discharge, as a fraction of the capacity. A smaller charge counts as regeneration within the discharge."""
 FIRST_ROWS, MAX_FIRST_ROWS = 4 * MIN_REFERENCE_ROWS, 8 * MIN_REFERENCE_ROWS
 """Minimum and maximum number of rows of the first discharges: about four and eight complete discharges."""
@@ -44,7 +44,7 @@ class Discharge:
     """Charge counter at its first row [A s]."""
 
     def weakest(self, cell: CellCurves, rows: NDArray[np.void]) -> list[ComparedCell]:
-        """Return an estimate for each reference.
+        """Return an estimate of the weakest cell for each reference.
 
         The SOC of a row is the SOC at the start minus the charge drawn since.
 
@@ -62,9 +62,9 @@ class Discharge:
 class BankMonitor:
     """Monitor of the weakest cell of one bank.
 
-    A discharge that shows a weak cell replaces the result of an earlier discharge at once. A discharge that shows no weak cell
-    replaces it only when its SOC is as low as that of the earlier discharge, because a weak cell shows near its empty end.
-    Discharges with a weak cell do not become part of the reference.
+    A discharge that shows a weak cell replaces the result of an earlier discharge immediately. A discharge that shows no weak
+    cell replaces it only when its SOC is as low as in the earlier discharge, because a weak cell is visible only near its empty
+    end. Discharges with a weak cell do not become part of the reference.
 
     Args:
         cell: Curves of the cell file.
@@ -85,7 +85,7 @@ class BankMonitor:
         self._discharge: Discharge | None = None
 
     def add(self, history: History, new: int, fit: PackFit) -> None:
-        """Evaluate the last ``new`` rows of a history, one by one. If the bank was exchanged, discard the results of the former bank.
+        """Evaluate the last ``new`` rows of a history, one by one. An exchange of the bank discards its results.
 
         Args:
             history: History of the bank; times of weak cells are added.
@@ -95,16 +95,20 @@ class BankMonitor:
         if fit.is_exchanged and self._discharge is not None and self._discharge.fit.first_segment < fit.first_segment:
             self.reset()
             history.weak_cell_times.clear()
-        if fit.is_exchanged and history.first is not None and history.first.fit.first_segment < fit.first_segment:
-            history.first = None
+        if (
+            fit.is_exchanged
+            and history.first_discharges is not None
+            and history.first_discharges.fit.first_segment < fit.first_segment
+        ):
+            history.first_discharges = None
         rows = history.rows[history.rows["segment"] >= fit.first_segment]
         for end in range(max(rows.size - new, 0) + 1, rows.size + 1):
             if is_discharge(rows[end - 1 : end]).all():
                 self._evaluate(rows[:end], history, fit)
 
     def _evaluate(self, rows: NDArray[np.void], history: History, fit: PackFit) -> None:
-        """Compare the discharge of the last row with its references. The result is that of the reference with the largest deviation."""
-        start = discharge_start(rows, CHARGED_SOC * self._cell.capacity_as)
+        """Compare the discharge of the last row with its references. The largest deviation gives the result."""
+        start = discharge_start(rows, MIN_CHARGE_SOC * self._cell.capacity_as)
         if self._discharge is None or self._discharge.start_s != rows["elapsed_s"][start]:
             self._discharge = self._new_discharge(rows, start, history, fit)
         discharge, measured = self._discharge, rows[start:][is_discharge(rows[start:])]
@@ -122,12 +126,12 @@ class BankMonitor:
         fit_before = self._discharge.fit if is_weak_now(weak) and self._discharge is not None else fit
         begin, earlier = rows[start : start + 1], reference_rows(rows[:start], weak)
         earlier["soc"] = row_soc(self._cell, fit_before, earlier)
-        if history.first is None and earlier.size >= FIRST_ROWS:
-            history.first = ReferenceDischarges(earlier[:MAX_FIRST_ROWS], fit_before)
+        if history.first_discharges is None and earlier.size >= FIRST_ROWS:
+            history.first_discharges = ReferenceDischarges(earlier[:MAX_FIRST_ROWS], fit_before)
         return Discharge(
             start_s=float(begin["elapsed_s"][0]),
             fit=fit_before,
-            references=list(self._references(ReferenceDischarges(earlier, fit_before), history.first)),
+            references=list(self._references(ReferenceDischarges(earlier, fit_before), history.first_discharges)),
             start_soc=float(row_soc(self._cell, fit, begin)[0]),
             start_as=float(begin["charge_as"][0]),
         )
@@ -142,9 +146,9 @@ class BankMonitor:
                 yield Reference(each.fit, curve, change)
 
     def _update_result(self, result: ComparedCell, weak: list[WeakCellTime], start_s: float, now_s: float) -> None:
-        """Replace the present result by that of a discharge, and update the times of weak cells, unless the discharge is too shallow.
+        """Replace the present result by that of a discharge, and update the times of weak cells.
 
-        A discharge replaces the result if it shows a weak cell, is as deep as the discharge of the present result, or is that
+        A discharge is ignored unless it shows a weak cell, is as deep as the discharge of the present result, or is that
         discharge.
 
         Args:

@@ -29,7 +29,7 @@ DIRECTION_STD_RANGE_V = 2e-3, 6e-3
 """Limits of the std of the error by direction [V]. The lower one is assumed for cells whose file was fitted to their own
 captures, and the upper one for generic cells."""
 OVERPOTENTIAL_STD_FRACTION = 0.25
-"""Relative std by which the overpotential at one SOC differs between charge and discharge, as a fraction of the std of ln R."""
+"""Relative std of the difference of the overpotential between charge and discharge, as a fraction of the std of ln R."""
 OVERPOTENTIAL_STD_RANGE = 0.04, 0.08
 """Limits of this relative std of the overpotential."""
 
@@ -65,7 +65,7 @@ class CellCurves:
         )
         """Std of the error by direction [V]."""
         self.drop_std = float(np.clip(OVERPOTENTIAL_STD_FRACTION * self.r_std, *OVERPOTENTIAL_STD_RANGE))
-        """Relative std by which the overpotential at one SOC differs between charge and discharge."""
+        """Relative std of the difference of the overpotential between charge and discharge at one SOC."""
         self.charge_error = float(settings["charge_error"])
         """Std of the SOC counted over a charge throughput of 1."""
         self.aged_soc = float(settings["aged_soc"])
@@ -131,7 +131,7 @@ class NodePosition:
 
     @property
     def weights(self) -> tuple[Floats, Floats]:
-        """Derivatives of the function by its values at the nodes below and above."""
+        """Derivatives of the function with respect to its values at the nodes below and above."""
         return 1.0 - self.fraction, self.fraction
 
     def interpolate(self, values: Floats, offset: NDArray[np.intp] | int = 0) -> Floats:

@@ -22,10 +22,10 @@ from bms_estimator.pack_model.unknowns import Unknowns
 HUBER = 3.0
 """Residual beyond which the cost of a voltage grows linearly, in std."""
 FITTED_RMS, ZONES = 0.3, 10
-"""RMS residual of the rows of one SOC zone and direction that the model can fit [std], and number of zones over SOC 0..1. Where
-the model fits the pack, it is 0.05 to 0.3."""
+"""RMS residual up to which the model fits the rows of one SOC zone and direction [std], and number of zones over SOC 0..1. Where
+the model fits the pack, the RMS residual is 0.05 to 0.3."""
 BEYOND_SOC = 0.03
-"""Distance of an SOC from the range 0..1 up to which it has no cost. Assumed."""
+"""Tolerated distance of an SOC from the range 0..1. Assumed."""
 BEYOND_STD = 0.01
 """Excess over ``BEYOND_SOC`` that costs as much as a residual of 1 std [SOC]. Assumed."""
 
@@ -39,7 +39,7 @@ class Block:
     columns: NDArray[np.intp]
     """Indices of the unknowns, increasing in each row, shape (n, k)."""
     values: Floats
-    """Derivatives of the prediction by these unknowns, in std, shape (n, k)."""
+    """Derivatives of the prediction with respect to these unknowns, in std, shape (n, k)."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +92,11 @@ class Equations:
         # the rows of one pass together have the weight of one row, because their errors are nearly equal
         self.weight = (rows["duration_s"] > 0.0) / np.sqrt(self.model.variance_v2 * self.intervals.rows_of_pass())
         """Inverse of the std of each row's voltage [1/V]; 0 for rows without a voltage."""
-        self.known = np.flatnonzero(np.isfinite(rows["reference_soc"]))
-        self.known_soc: Floats = rows["reference_soc"][self.known]
-        kind = rows["reference_kind"][self.known]
+        self.known_rows = np.flatnonzero(np.isfinite(rows["reference_soc"]))
+        self.known_soc: Floats = rows["reference_soc"][self.known_rows]
+        kind = rows["reference_kind"][self.known_rows]
         self.is_full = kind == FULL
-        std = np.where(self.is_full, FULL_REPEAT_STD, rows["reference_std"][self.known])
+        std = np.where(self.is_full, FULL_REPEAT_STD, rows["reference_std"][self.known_rows])
         # all ends of discharge together have the weight of one, because they have the same error
         self.known_std = std * np.where(kind == EMPTY, math.sqrt(max(int((kind == EMPTY).sum()), 1)), 1.0)
 
@@ -108,7 +108,7 @@ class Equations:
         Returns:
             True if a weight changed.
         """
-        zone = (np.clip(r.prediction.soc, 0.0, 0.999) * ZONES).astype(np.intp)
+        zone = (np.clip(r.prediction.soc, 0.0, 0.999) * ZONES).astype(np.intp)  # SOC 1 is in the last zone
         zone += ZONES * (self.rows["direction"] + 1.0).astype(np.intp)
         has_voltage = self.weight > 0.0
         rows = np.maximum(np.bincount(zone, has_voltage), 1)
@@ -120,7 +120,7 @@ class Equations:
         """Return residuals and cost at ``x``."""
         p = self.model.predict(x)
         voltage = self.weight * (self.voltage_v - p.voltage_v)
-        reference = (self.known_soc - p.soc[self.known] - self.is_full * x[self.unknowns.full]) / self.known_std
+        reference = (self.known_soc - p.soc[self.known_rows] - self.is_full * x[self.unknowns.full]) / self.known_std
         beyond = (np.minimum(p.soc + BEYOND_SOC, 0.0) + np.maximum(p.soc - 1.0 - BEYOND_SOC, 0.0)) / BEYOND_STD
         link_cost, links = self._link(x)
         deviation = x - self.prior.mean
@@ -149,9 +149,9 @@ class Equations:
     def _soc_blocks(self, r: Residuals) -> tuple[Block, Block]:
         """Return the blocks of known SOCs and of SOCs beyond their tolerated range."""
         columns, values = self.model.soc_derivatives(r.x)
-        known, out = self.known, np.flatnonzero(r.beyond)
-        known_columns = np.column_stack([columns[known], np.full(known.size, self.unknowns.full.start)])
-        known_values = np.column_stack([values[known], self.is_full]) / self.known_std[:, None]
+        known_rows, out = self.known_rows, np.flatnonzero(r.beyond)
+        known_columns = np.column_stack([columns[known_rows], np.full(known_rows.size, self.unknowns.full.start)])
+        known_values = np.column_stack([values[known_rows], self.is_full]) / self.known_std[:, None]
         return (
             Block(r.reference, known_columns, known_values),
             Block(-r.beyond[out], columns[out], values[out] / BEYOND_STD),
@@ -186,6 +186,6 @@ def huber_cost(residual: Floats) -> float:
 
 
 def huber_weight(residual: Floats) -> Floats:
-    """Return the factor on residuals and their derivatives with which least squares has the gradient of Huber's cost."""
+    """Return the factor on residuals and derivatives that makes the gradient of least squares equal that of Huber's cost."""
     weight: Floats = np.sqrt(HUBER / np.maximum(np.abs(residual), HUBER))
     return weight

@@ -23,7 +23,7 @@ from bms_estimator.pack_model.prediction import Reference
 from bms_estimator.pack_model.solve import Minimum, minimize, single_threaded
 from bms_estimator.pack_model.unknowns import SCALES
 
-MAX_RATIO = 3.0
+MAX_RMS_RATIO = 3.0
 """Ratio of the RMS residuals after and before the last gap above which the pack was exchanged."""
 MIN_RESIDUAL = 0.15
 """Minimum of the RMS residual before the gap in the ratio [std]. A fit of a small number of rows leaves too small residuals."""
@@ -50,7 +50,7 @@ def is_exchanged(rows: NDArray[np.void], residuals: Residuals) -> bool:
     mean_c = temperature_c[after].mean()
     if not temperature_c[before].min() - MARGIN_K < mean_c < temperature_c[before].max() + MARGIN_K:
         return False
-    return rms(residuals.voltage[after]) > MAX_RATIO * max(rms(residuals.voltage[before]), MIN_RESIDUAL)
+    return rms(residuals.voltage[after]) > MAX_RMS_RATIO * max(rms(residuals.voltage[before]), MIN_RESIDUAL)
 
 
 def rms(values: Floats) -> float:
@@ -61,8 +61,8 @@ def rms(values: Floats) -> float:
 STARTS = ((0.0, 0.0), (0.08, 0.0), (-0.08, 0.0), (0.16, 0.0), (-0.16, 0.0), (0.0, 0.08), (0.0, -0.08))
 """Starts of the minimization: shift of all SOCs, and ln of the true over the declared capacity. The cost of a flat curve has
 several minima over the SOC."""
-REACH_SOC, REACH_STD = 0.02, 4.0
-"""Largest shift of a start near a previous fit: an SOC plus a multiple of the std of its SOC."""
+MAX_SHIFT_SOC, MAX_SHIFT_STD = 0.02, 4.0
+"""Maximum shift of a start from a precise previous fit: an SOC, plus a multiple of the std of the fitted SOC."""
 LIKELIHOOD_EXPONENT = 0.5
 """Exponent of the likelihood in the weights of minima. It is below 1, because errors of different passes are not quite
 independent."""
@@ -169,7 +169,7 @@ def reference_of(previous: PackFit, rows: NDArray[np.void]) -> Reference:
 
 
 def _fit_at_reference(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None) -> PackFit:
-    """Fit the rows. Their std is computed at the previous fit; without one, at a preliminary fit."""
+    """Fit the rows. Their std is computed at the previous fit, or at a preliminary fit if there was no previous fit."""
     if previous is None:
         previous = _minimize_from_all_starts(cell, rows, Reference(rows["soc"], np.zeros(SCALES)), None)
     return _minimize_from_all_starts(cell, rows, reference_of(previous, rows), previous)
@@ -200,19 +200,19 @@ def distinct_minima(equations: Equations, from_starts: list[Floats]) -> list[Min
 def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
     """Return the starts of the minimization: those near the previous fit, then those around the filter's SOC.
 
-    A shift that exceeds the uncertainty of the previous fit is left out, unless the age of the history has doubled or a long
+    A shift that exceeds the uncertainty of the previous fit is omitted, unless the age of the history has doubled or a long
     gap may hide a charge.
     """
-    rows, results, reach = equations.rows, [], math.inf
+    rows, results, max_shift = equations.rows, [], math.inf
     if previous is not None:
         results = starts_near(equations, previous)
         gap_s = rows["gap_s"][rows["segment"] > previous.segment].max(initial=0.0)
         # the binary exponent grows by 1 when the age doubles
         has_doubled = math.frexp(rows["elapsed_s"][-1])[1] != math.frexp(previous.elapsed_s)[1]
         if not has_doubled and gap_s < equations.model.cell.event_s:
-            reach = REACH_SOC + REACH_STD * math.sqrt(previous.covariance[SOC, SOC])
+            max_shift = MAX_SHIFT_SOC + MAX_SHIFT_STD * math.sqrt(previous.covariance[SOC, SOC])
     for shift, ln_q in STARTS:
-        if abs(shift) > reach:
+        if abs(shift) > max_shift:
             continue
         x = equations.prior.mean.copy()
         x[equations.unknowns.soc] = filter_soc(equations, ln_q) + shift
@@ -320,15 +320,15 @@ def mixture_moments(weights: Floats, moments: list[tuple[Floats, Floats]]) -> tu
 def _results(equations: Equations, minimum: Minimum) -> tuple[Floats, Floats]:
     """Return mean and covariance of the results at one minimum. The results are linear functions of the unknowns."""
     u, x, model = equations.unknowns, minimum.x, equations.model
-    select = np.zeros((CURVE.stop, u.size))
+    derivatives = np.zeros((CURVE.stop, u.size))
     columns, values = model.soc_derivatives(x)
-    select[SOC, columns[-1]] = values[-1]
-    select[LN_Q, u.ln_q.stop - 1] = 1.0
-    select[OFFSET, u.offset.stop - 1] = 1.0
-    select[LN_R, u.ln_r] = np.eye(SCALES)
+    derivatives[SOC, columns[-1]] = values[-1]
+    derivatives[LN_Q, u.ln_q.stop - 1] = 1.0
+    derivatives[OFFSET, u.offset.stop - 1] = 1.0
+    derivatives[LN_R, u.ln_r] = np.eye(SCALES)
     position, nodes = NodePosition.of(NODE_SOC, CURVE_NODES), np.arange(CURVE.start, CURVE.stop)
     for at, weight in zip((position.below, position.below + 1), position.weights, strict=True):
-        select[nodes, u.curve.start + at] = weight
-    mean = select @ x
+        derivatives[nodes, u.curve.start + at] = weight
+    mean = derivatives @ x
     mean[SOC] = model.soc(x)[-1]
-    return mean, minimum.covariance_of(select)
+    return mean, minimum.covariance_of(derivatives)

@@ -1,4 +1,4 @@
-"""Hand-over of a fit to the filter.
+"""Transfer of a fit's results to the filter.
 
 The fitted curves replace those in the filter's settings. SOC, capacity and offset of the fit, with their covariance, replace
 those in the filter's state.
@@ -62,7 +62,7 @@ def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> Non
 
 
 def _adopt_ocv(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
-    """Write the fitted OCV and its std. The error by direction is the varying part of the variance (``CURVE``)."""
+    """Write the fitted OCV and its std. The error by direction becomes ``varying_error_v``."""
     series = float(file_settings["series"])
     soc = np.linspace(0.0, 1.0, file_settings["ocv_v"].size)
     ocv_v = file_settings["ocv_v"] + series * np.interp(soc, SOC_GRID, fit.curve_v)
@@ -88,7 +88,7 @@ def _adopt_resistances(settings: np.void, file_settings: np.void, fit: PackFit) 
 
 
 def smallest_soc_std(fit: PackFit) -> float:
-    """Return the std at the SOC that is known best: the SOC at which errors of SOC and capacity cancel.
+    """Return the smallest std over SOC. It is at the SOC at which the errors of SOC and capacity cancel.
 
     The voltages until the next fit have the same errors as the fitted ones. They therefore cannot lower the std of the SOC
     below this value.
@@ -105,7 +105,7 @@ def r_std(fit: PackFit) -> float:
 
 
 def adopt_state(estimator: Estimator, fit: PackFit) -> None:
-    """Hand SOC, offset, capacity and their covariances with the curve to the filter, whose settings have the fitted curves.
+    """Set SOC, offset and capacity of the filter, with their covariances with the curve, after ``adopt_curves``.
 
     After a gap since the fit's last row each hypothesis of the filter keeps its SOC.
     """

@@ -1,7 +1,7 @@
 """History of a pack with a bounded number of rows. Old rows are merged.
 
-A segment is a time without gaps that may hide a charge. A bank is a pack of several cells in series of which only the sum of the
-voltages is evaluated: its weak cell is found by a comparison with the first discharges (``bank_comparison``).
+A segment is a time without a gap that could hide a charge. A bank is a pack of several cells in series, of which only the sum of
+the voltages is evaluated. Its weak cell is found by a comparison with its first discharges (``bank_comparison``).
 """
 
 from collections.abc import Sequence
@@ -23,14 +23,15 @@ MAX_SEGMENTS = 100
 """Maximum number of segments. Each adds about five unknowns to the fit, whose time grows with the cube of their number: with 100
 segments a fit of 30 days takes four times as long as with one."""
 RECENT_SEGMENTS = MAX_SEGMENTS // 2
-"""Number of the latest segments that are kept even without a known SOC. Before them, segments with a known SOC take precedence."""
+"""Number of the latest segments that are kept even without a known SOC. Of earlier segments, those with a known SOC are
+preferred."""
 DAY_S = 86400.0
 """Length of a day [s]."""
 MEAN_FIELDS = ("elapsed_s", "voltage_v", "current_a", "between_a2", "skew_a2", "x_a", "settled_s", "temperature_c", "charge_as",
                "charge_variance_as2", "throughput_soc", "hysteresis", "soc")  # fmt: skip
-"""Fields of ``HISTORY_ROW`` of which a merged row has the mean, weighted by duration."""
+"""Fields of ``HISTORY_ROW`` that a merged row averages, weighted by duration."""
 OLD_S = 2.0 * DAY_S
-"""Age from which on rows are merged [s]."""
+"""Minimum age of merged rows [s]."""
 
 
 class WeakCellTime(NamedTuple):
@@ -59,19 +60,19 @@ class History:
     Attributes:
         rows: Shape (n,), dtype HISTORY_ROW.
         weak_cell_times: Times in which a cell of the bank was weak.
-        first: First discharges of the bank; None: too few rows, or no bank. They do not change, so that a slowly weakening
-            cell deviates from them.
+        first_discharges: First discharges of the bank; None: too few rows, or no bank. They do not change, so that a slowly
+            weakening cell deviates from them.
     """
 
     def __init__(
         self,
         rows: NDArray[np.void] | None = None,
         weak_cell_times: Sequence[WeakCellTime] = (),
-        first: ReferenceDischarges | None = None,
+        first_discharges: ReferenceDischarges | None = None,
     ) -> None:
         self.rows: NDArray[np.void] = np.zeros(0, HISTORY_ROW) if rows is None else rows
         self.weak_cell_times = list(weak_cell_times)
-        self.first = first
+        self.first_discharges = first_discharges
 
     def append(self, rows: NDArray[np.void], capacity_as: float) -> None:
         """Append rows. If there are too many, merge old rows, and drop the oldest if there are still too many."""
@@ -85,8 +86,8 @@ def bounded_segments(rows: NDArray[np.void], first_new: float, capacity_as: floa
     """Return the rows of the ``MAX_SEGMENTS`` segments with the most information.
 
     Segments that neither change nor determine the SOC are dropped first. Then older ones without a known SOC are dropped, because
-    known SOCs determine capacity and offset over a long time. Within each group the oldest are dropped first. The charge of a dropped
-    segment is added to the gap before the next one.
+    known SOCs determine capacity and offset over a long time. Within each group the oldest are dropped first. The charge of a
+    dropped segment is added to the gap before the next one.
 
     Args:
         rows: Shape (n,), dtype HISTORY_ROW, in order of time.
@@ -101,11 +102,11 @@ def bounded_segments(rows: NDArray[np.void], first_new: float, capacity_as: floa
     moved_as = np.maximum.reduceat(charge_as, starts) - np.minimum.reduceat(charge_as, starts)
     is_known = np.logical_or.reduceat(np.isfinite(rows["reference_soc"]), starts)
     is_recent = np.arange(starts.size) >= starts.size - RECENT_SEGMENTS
-    value = np.where(is_known | is_recent, 2, 1)
-    value[~is_known & (moved_as < ROW_SOC * capacity_as)] = 0
-    value[rows["segment"][starts] >= first_new] = 3
+    priority = np.where(is_known | is_recent, 2, 1)
+    priority[~is_known & (moved_as < ROW_SOC * capacity_as)] = 0
+    priority[rows["segment"][starts] >= first_new] = 3
     is_dropped = np.zeros(starts.size, bool)
-    is_dropped[np.argsort(value, kind="stable")[:excess]] = True
+    is_dropped[np.argsort(priority, kind="stable")[:excess]] = True
     return _without_segments(rows, np.append(starts, rows.size), is_dropped)
 
 
@@ -116,9 +117,8 @@ def _without_segments(
     rows, sizes = rows.copy(), np.diff(bounds)
     for k in np.flatnonzero(is_dropped[:-1]).tolist():
         first, last, after = rows[bounds[k]], rows[bounds[k + 1] - 1], rows[bounds[k + 1] : bounds[k + 2]]
-        after["charge_as"] += last[
-            "charge_as"
-        ]  # the charge of a row counts from before the gap in front of its segment
+        # the charge counter of a segment starts at the end of the previous segment
+        after["charge_as"] += last["charge_as"]
         after["charge_variance_as2"] += last["charge_variance_as2"]
         after["gap_s"] += last["gap_s"] + last["elapsed_s"] - first["elapsed_s"]
     kept: NDArray[np.void] = rows[~np.repeat(is_dropped, sizes)]

@@ -35,7 +35,7 @@ class Intervals:
     Attributes:
         starts, ends: First and last row of each interval.
         of_row: Interval of each row.
-        is_new_segment: Whether a segment begins with the interval.
+        is_new_segment: True for each interval that begins a segment.
         segment: Segment of each row, counted from 0.
         drawn_soc: Charge drawn since the interval's first row, as a fraction of the declared capacity, for each row.
         hours: Time since the interval's first row [h], for each row.

@@ -96,8 +96,8 @@ class Overpotential:
 def row_soc(cell: CellCurves, fit: PackFit, rows: NDArray[np.void]) -> Floats:
     """Return the SOC of rows.
 
-    Up to the last row of the fit, it is the fitted SOC. For later rows, it is the SOC at the end of the fit minus the charge drawn
-    since then. If a gap separates a row from the fit, it is the SOC of the filter.
+    Up to the last row of the fit, it is the fitted SOC. For later rows, it is the SOC at the end of the fit minus the charge
+    drawn since then. If a gap separates a row from the fit, it is the SOC of the filter.
     """
     since_fit = drawn_soc(cell, fit, rows["charge_as"] - fit.charge_as)
     counted = np.where(rows["segment"] == fit.segment, fit.mean[SOC] - since_fit, rows["soc"])

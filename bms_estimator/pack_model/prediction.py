@@ -51,7 +51,8 @@ GROUP_STARTS = [RESISTANCE_GROUPS.index(group) for group in range(SCALES)]
 """First resistance of each group."""
 
 Derivatives = tuple[NDArray[np.intp], Floats]
-"""Non-zero derivatives of n values by the unknowns: indices of the unknowns and derivatives, both of shape (n, k)."""
+"""Non-zero derivatives of n values with respect to the unknowns: indices of the unknowns and derivatives, both of shape (n,
+k)."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class VoltageModel:
         current_a = np.column_stack([rows["current_a"], rows["x_a"]])
         z = np.clip(reference.soc, 0.0, 1.0)
         ohm = cell.resistances(z, weak, strong)
-        drop_v = by_group(ohm * current_a) @ np.exp(reference.ln_r)
+        drop_v = sum_by_group(ohm * current_a) @ np.exp(reference.ln_r)
         terms = np.zeros(rows.size, MODEL_ROW)
         terms["interval"], terms["segment"], terms["direction"] = (
             intervals.of_row,
@@ -110,8 +111,8 @@ class VoltageModel:
         terms["current_a"], terms["hysteresis"] = current_a, rows["hysteresis"]
         # the hysteresis at the start of the segment, an unknown, decays with the throughput
         terms["start_h_decay"] = np.exp(-rows["throughput_soc"][:, None] / np.array(HYSTERESIS_SOC))
-        # currents that the RC pairs keep from a load of one std before their reset; the load is an unknown
-        terms["start_load_a"] = START_LOAD_C * cell.one_c_a * kept_fraction(rows)
+        # currents that remain in the RC pairs from a load of one std before their reset; the load is an unknown
+        terms["start_load_a"] = START_LOAD_C * cell.one_c_a * remaining_fraction(rows)
         terms["aging_trend"] = AgingVariance(RESISTANCE, cell, intervals).trend[intervals.of_row]
         terms["direction_v"] = np.sqrt(
             cell.direction_std_v**2 + (cell.drop_std * drop_v) ** 2 + variance_between_nodes(cell, z)
@@ -119,8 +120,8 @@ class VoltageModel:
         self.rows = terms
         """Quantities of each row, dtype MODEL_ROW."""
         scaled_ohm = ohm * np.exp(reference.ln_r)[np.array(RESISTANCE_GROUPS)]
-        self.variance_v2 = self._variance(z, drop_v) + by_sampling(rows, scaled_ohm)
-        self.variance_v2 += by_surface(cell, rows, z, drop_v, strong)
+        self.variance_v2 = self._variance(z, drop_v) + sampling_variance(rows, scaled_ohm)
+        self.variance_v2 += surface_variance(cell, rows, z, drop_v, strong)
         """Variance of each row's voltage about its prediction [V^2]."""
 
     def _variance(self, z: Floats, drop_v: Floats) -> Floats:
@@ -136,7 +137,7 @@ class VoltageModel:
         return np.asarray(x[u.soc][k] - self._drawn_soc(x) * np.exp(-x[u.ln_q][k]))
 
     def soc_derivatives(self, x: Floats) -> Derivatives:
-        """Return the derivatives of the SOC of each row by SOC, offset and ln of the capacity of its interval."""
+        """Return the derivatives of the SOC of each row with respect to SOC, offset and ln of the capacity of its interval."""
         u, k = self.unknowns, self.intervals.of_row
         inverse_q = np.exp(-x[u.ln_q][k])
         at = np.column_stack([u.soc.start + k, u.offset.start + k, u.ln_q.start + k])
@@ -178,11 +179,11 @@ class VoltageModel:
         return (above_v - below_v) / ROW_SOC
 
 
-def by_surface(cell: CellCurves, rows: NDArray[np.void], z: Floats, drop_v: Floats, strong: Floats) -> Floats:
-    """Return the variance of each discharge row's voltage by the SOC at the surface of the particles [V^2].
+def surface_variance(cell: CellCurves, rows: NDArray[np.void], z: Floats, drop_v: Floats, strong: Floats) -> Floats:
+    """Return the variance of each discharge row's voltage due to the SOC at the surface of the particles [V^2].
 
-    The slope of the OCV is that at the SOC which the voltage shows, if this is the lower one, because a collapsed voltage follows
-    the slope of the knee.
+    The slope of the OCV is that at the lower of the SOC and the SOC that corresponds to the voltage, because a collapsed voltage
+    follows the slope of the knee.
 
     Args:
         cell: Curves of the cell file.
@@ -197,8 +198,8 @@ def by_surface(cell: CellCurves, rows: NDArray[np.void], z: Floats, drop_v: Floa
     return np.asarray((cell.slope(lowest) * std_soc) ** 2)
 
 
-def by_sampling(rows: NDArray[np.void], ohm: Floats) -> Floats:
-    """Return the variance of each row's voltage by slow or skewed sampling [V^2].
+def sampling_variance(rows: NDArray[np.void], ohm: Floats) -> Floats:
+    """Return the variance of each row's voltage due to slow or skewed sampling [V^2].
 
     The current through R_0 is measured with the voltage unless they have different times. The current through the RC pairs
     is always interpolated between samples.
@@ -210,8 +211,8 @@ def by_sampling(rows: NDArray[np.void], ohm: Floats) -> Floats:
     return np.asarray(ohm[:, 0] ** 2 * rows["skew_a2"] + ohm[:, 1:].sum(axis=1) ** 2 * rows["between_a2"])
 
 
-def kept_fraction(rows: NDArray[np.void]) -> Floats:
-    """Return the fraction that each resistance's current keeps of its value at the reset of the RC pairs, shape (n, RESISTANCES).
+def remaining_fraction(rows: NDArray[np.void]) -> Floats:
+    """Return the fraction of each resistance's current at the reset of the RC pairs that remains, shape (n, RESISTANCES).
 
     It is a mean over the row, and 0 for the series resistance.
     """
@@ -220,6 +221,6 @@ def kept_fraction(rows: NDArray[np.void]) -> Floats:
     return np.column_stack([np.zeros(rows.size), pairs])
 
 
-def by_group(values: Floats) -> Floats:
+def sum_by_group(values: Floats) -> Floats:
     """Return the sum over the resistances of each group, shape (n, SCALES)."""
     return np.asarray(np.add.reduceat(values, GROUP_STARTS, axis=1))

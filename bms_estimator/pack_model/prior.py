@@ -25,8 +25,8 @@ SLIP_SOC = 0.02
 SLIP_CORRELATION_SOC = 0.3
 """Correlation length of the slip [SOC]."""
 MAX_SLIP_FRACTION = 0.85
-"""Maximum std of the voltage error by the slip, as a fraction of the OCV's std. The remaining error does not depend on the slope
-of the curve."""
+"""Maximum std of the voltage error due to the slip, as a fraction of the OCV's std. The remaining error does not depend on the
+slope of the curve."""
 MAX_SLIP_SLOPE_V = 5.0
 """Maximum slope of the OCV that converts a slip to a voltage [V per unit SOC], equal to ``filter_settings.MAX_SLOPE_V``. The SOC
 is better defined at the steep ends."""
@@ -35,7 +35,7 @@ ROUNDING_V2 = 1e-10
 DIRECTION_CORRELATION_SOC = 0.1
 """Correlation length of the error by direction [SOC]."""
 SHAPE_STD, SHAPE_CORRELATION_SOC = 0.15, 0.4
-"""Std and correlation length [SOC] of the relative error with which the file describes the resistances over SOC."""
+"""Std and correlation length [SOC] of the relative error of the file's resistances over SOC."""
 EMPTY_SHAPE_STD = 0.5
 """Std of this relative error at SOC 0. Resistances near empty depend on the cell and on the load: at SOC 0 they are 1.4 to 3.4
 times those at SOC 0.5 in the cell files of Leaf, NCR18650, A123 and PF."""
@@ -46,7 +46,7 @@ HYSTERESIS_MEAN, HYSTERESIS_STD = 0.5, 0.5
 ENTROPY_STD_V = 1.5e-4
 """Std of the error of the OCV's temperature coefficient [V/K]."""
 ARRHENIUS_STD = 0.015
-"""Std of the error of the relative change of the resistances by temperature [1/K]."""
+"""Std of the error of the relative change of the resistances with temperature [1/K]."""
 MIN_FULL_STD = 0.006
 """Minimum std of the SOC at which this pack's charger ends, common to all charges."""
 FULL_REPEAT_STD = 0.01
@@ -90,7 +90,7 @@ class Prior:
         self._add_capacity(cell, intervals, u)
 
     def faults(self, u: Unknowns, x: Floats) -> InputFault:
-        """Return the faults that unknowns beyond ``FAULT_STDS`` show. Unknowns of different kinds are independent in the prior."""
+        """Return the faults that unknowns beyond ``FAULT_STDS`` indicate. Kinds of unknowns are independent in the prior."""
 
         def is_far(part: slice) -> bool:
             variance = np.diag(np.linalg.inv(self.precision[part, part]))
@@ -176,9 +176,9 @@ def full_std(rows: NDArray[np.void]) -> float:
 def scale_covariance(r_std: float) -> Floats:
     """Return the prior covariance of ln of the factors on the resistances, shape (SCALES, SCALES)."""
     common = max(r_std**2 - INDEPENDENT_R_STD**2, 0.0)
-    own = r_std**2 - common
-    covariance: Floats = np.full((SCALES, SCALES), common) + np.diag(np.full(SCALES, own))
-    covariance[1, 2] = covariance[2, 1] = common + RC_CORRELATION * own
+    independent = r_std**2 - common
+    covariance: Floats = np.full((SCALES, SCALES), common) + np.diag(np.full(SCALES, independent))
+    covariance[1, 2] = covariance[2, 1] = common + RC_CORRELATION * independent
     return covariance
 
 

@@ -52,7 +52,7 @@ def _append_saved(estimator: Estimator, history: History, capacity_as: float) ->
     return True
 
 
-def _row_at_checkpoint(h: np.void, f: np.void, last: np.void) -> np.ndarray:
+def _row_at_checkpoint(h: np.void, filter_state: np.void, last: np.void) -> np.ndarray:
     """Return a row without a voltage, with the charge up to the checkpoint.
 
     The next segment is linked to it. ``last`` is the last saved row.
@@ -63,6 +63,6 @@ def _row_at_checkpoint(h: np.void, f: np.void, last: np.void) -> np.ndarray:
     row["gap_s"] = last["gap_s"] if last["segment"] == h["segment"] else math.inf
     for name in ("charge_as", "charge_variance_as2", "throughput_soc", "hysteresis"):
         row[name] = h[name]
-    row["temperature_c"], row["soc"] = f["temperature_c"], f["soc"]
+    row["temperature_c"], row["soc"] = filter_state["temperature_c"], filter_state["soc"]
     row["reference_soc"] = row["reference_std"] = math.nan
     return row

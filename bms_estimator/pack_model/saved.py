@@ -22,21 +22,21 @@ from bms_estimator.pack_model.unknowns import DIRECTIONS
 
 SAVED_MINIMA = 2
 """Number of a fit's minima that are saved. The next fit starts from two minima (``fit.starts``)."""
-_RESULTS = CURVE.stop
+_RESULT_COUNT = CURVE.stop
 """Number of results of a fit. ``CURVE`` is the last part of them."""
-_FITTED_SOC = (-2.0, 3.0)
+_SOC_RANGE = (-2.0, 3.0)
 """Plausible range of a fitted SOC, which the fit does not limit."""
 MAX_RESULT = 20.0
 """Maximum plausible absolute value of a result of a fit: an SOC, a voltage of one cell [V], or ln of a ratio."""
 MAX_COST = 1e15
 """Maximum plausible absolute cost of a fit."""
-_RESULT = (-MAX_RESULT, MAX_RESULT)
+_RESULT_RANGE = (-MAX_RESULT, MAX_RESULT)
 FIT_SHAPES = {
     "elapsed_s": (),
     "segment": (),
     "charge_as": (),
-    "mean": (_RESULTS,),
-    "covariance": (_RESULTS, _RESULTS),
+    "mean": (_RESULT_COUNT,),
+    "covariance": (_RESULT_COUNT, _RESULT_COUNT),
     "curve_v": (SOC_GRID.size,),
     "ln_r": (SOC_GRID.size, 3),
     "hysteresis": (),
@@ -48,15 +48,15 @@ _FIT_RANGES = {
     "elapsed_s": TIME,
     "segment": SEGMENT,
     "charge_as": CHARGE,
-    "mean": _RESULT,
+    "mean": _RESULT_RANGE,
     "covariance": (-(MAX_RESULT**2), MAX_RESULT**2),
-    "curve_v": _RESULT,
-    "ln_r": _RESULT,
+    "curve_v": _RESULT_RANGE,
+    "ln_r": _RESULT_RANGE,
     "hysteresis": (0.0, math.exp(MAX_RESULT)),
     "cost": (-MAX_COST, MAX_COST),
     "first_segment": SEGMENT,
     "row_elapsed_s": TIME,
-    "row_soc": _FITTED_SOC,
+    "row_soc": _SOC_RANGE,
     "curves": (-MAX_COST, MAX_COST),
 }
 """Range of each saved field of a fit."""
@@ -73,7 +73,7 @@ def curve_arrays(fit: PackFit | None) -> dict[str, NDArray[Any]]:
     return {} if fit is None else {name: np.array(getattr(fit, name)) for name in FIT_SHAPES}
 
 
-def fit_of_curves(arrays: Arrays) -> PackFit | None:
+def fit_from_arrays(arrays: Arrays) -> PackFit | None:
     """Return the fit of ``curve_arrays``, without the fields from which the next fit starts.
 
     Raises:
@@ -92,8 +92,8 @@ def fit_of_curves(arrays: Arrays) -> PackFit | None:
         raise ValueError("the covariance of the fit is damaged")
     if values["first_segment"] > values["segment"]:
         raise ValueError("the fit begins after its last segment")
-    none = np.zeros(0)
-    return PackFit(**values, row_elapsed_s=none, row_soc=none, curves=())
+    empty = np.zeros(0)
+    return PackFit(**values, row_elapsed_s=empty, row_soc=empty, curves=())
 
 
 def _fit_field(arrays: Arrays, name: str) -> Floats:
@@ -111,18 +111,18 @@ def _fit_field(arrays: Arrays, name: str) -> Floats:
 def neutral_fit() -> PackFit:
     """Return a fit that corrects nothing. The service adopts it before the first sample to compile the code."""
     values: dict[str, Any] = {name: np.zeros(shape) if shape else 0.0 for name, shape in FIT_SHAPES.items()}
-    values |= {"covariance": np.eye(_RESULTS), "hysteresis": 1.0}
-    none = np.zeros(0)
-    return PackFit(**values, row_elapsed_s=none, row_soc=none, curves=())
+    values |= {"covariance": np.eye(_RESULT_COUNT), "hysteresis": 1.0}
+    empty = np.zeros(0)
+    return PackFit(**values, row_elapsed_s=empty, row_soc=empty, curves=())
 
 
 def history_arrays(history: History, fit: PackFit | None) -> dict[str, NDArray[Any]]:
     """Return history and fit as arrays by name."""
     weak_s = np.array(history.weak_cell_times).reshape(-1, len(WeakCellTime._fields))
     arrays = {"rows": history.rows, "weak_cell_times": weak_s, **curve_arrays(fit)}
-    if history.first is not None:
-        arrays["bank_rows"] = history.first.rows
-        arrays |= {BANK_PREFIX + name: array for name, array in curve_arrays(history.first.fit).items()}
+    if history.first_discharges is not None:
+        arrays["bank_rows"] = history.first_discharges.rows
+        arrays |= {BANK_PREFIX + name: array for name, array in curve_arrays(history.first_discharges.fit).items()}
     if fit is not None:
         arrays |= {"row_elapsed_s": fit.row_elapsed_s, "row_soc": fit.row_soc}
         arrays["curves"] = np.array(fit.curves[:SAVED_MINIMA]).reshape(min(len(fit.curves), SAVED_MINIMA), -1)
@@ -135,14 +135,14 @@ def _weak_cell_times(arrays: Arrays) -> list[WeakCellTime]:
     if saved is None or saved.dtype != float or saved.ndim != 2 or saved.shape[1] != len(WeakCellTime._fields):
         raise ValueError("the times of weak cells are damaged")
     start_s, end_s, soc = saved.T
-    if not (is_within(start_s, TIME) and (end_s >= start_s).all() and is_within(soc, _FITTED_SOC)):
+    if not (is_within(start_s, TIME) and (end_s >= start_s).all() and is_within(soc, _SOC_RANGE)):
         raise ValueError("the times of weak cells are damaged")
     return [WeakCellTime(*row) for row in saved.tolist()]
 
 
 def _first_discharges(arrays: Arrays) -> ReferenceDischarges | None:
     """Return the first discharges of a bank; None if none were saved."""
-    fit = fit_of_curves({name: arrays[BANK_PREFIX + name] for name in FIT_SHAPES if BANK_PREFIX + name in arrays})
+    fit = fit_from_arrays({name: arrays[BANK_PREFIX + name] for name in FIT_SHAPES if BANK_PREFIX + name in arrays})
     return None if fit is None else ReferenceDischarges(_rows(arrays, "bank_rows"), fit)
 
 
@@ -154,14 +154,14 @@ def _rows(arrays: Arrays, name: str) -> NDArray[np.void]:
     return rows
 
 
-def history_of(arrays: Arrays) -> tuple[History, PackFit | None]:
+def history_from_arrays(arrays: Arrays) -> tuple[History, PackFit | None]:
     """Return history and fit of ``history_arrays``.
 
     Raises:
         ValueError: A field is missing, or has another layout or an implausible value.
     """
     history = History(_rows(arrays, "rows"), _weak_cell_times(arrays), _first_discharges(arrays))
-    fit = fit_of_curves({name: value for name, value in arrays.items() if name in FIT_SHAPES})
+    fit = fit_from_arrays({name: value for name, value in arrays.items() if name in FIT_SHAPES})
     if fit is None:
         return history, None
     elapsed_s, soc, curves = (_fit_field(arrays, name) for name in ("row_elapsed_s", "row_soc", "curves"))

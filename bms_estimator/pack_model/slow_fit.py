@@ -1,4 +1,4 @@
-"""Slow fit: records the history of an estimator, fits the pack's model to it at intervals, and hands each fit to the filter."""
+"""Slow fit of the pack's model to the recorded history of an estimator, at intervals. The filter adopts each fit."""
 
 import math
 from collections.abc import Callable
@@ -24,7 +24,7 @@ FIT_INTERVAL_S = 3600.0
 MIN_INTERVAL_S = 1800.0
 """Minimum interval between two fits [s]. Under load, a fit to the first half hour already determines the SOC better than the
 filter."""
-INTERVAL_OF_AGE = 1.0 / 12.0
+INTERVAL_PER_AGE = 1.0 / 12.0
 """Interval between two fits as a fraction of the age of the history, within its limits: an hour after twelve hours. A row
 changes a fit of a short history more than a fit of a long one."""
 ADOPT_DELAY_S = 120.0
@@ -33,13 +33,13 @@ another thread. A replay waits for the fit, and adopts it at the same sample."""
 MIN_ROWS = 8
 """Minimum number of new rows for a fit."""
 MIN_GROWTH, MAX_CERTAIN_STD = 0.04, 0.015
-"""Minimum number of new rows for a fit, as a fraction of all rows, if the std of the previous fit's SOC is at most ``MAX_CERTAIN_STD``.
-Fewer rows hardly change such a fit. With a larger std, a few rows may decide between several minima."""
+"""Minimum number of new rows for a fit, as a fraction of all rows, if the std of the previous fit's SOC is at most
+``MAX_CERTAIN_STD``. Fewer rows hardly change such a fit. With a larger std, a few rows may decide between several minima."""
 MAX_UNKNOWN_CURRENT = 0.05
-"""Maximum variance of the current at the times of the voltages, as a fraction of its mean square, for a fit. An error of the current
-makes the fitted resistances too small by about this fraction, because least squares assume exact currents. The error of the resistances
-then distorts OCV and capacity. The fraction is 0.02 for a load that changes every 20 s if voltage and current come every 10 s, 5 s apart,
-and 0.2 to 0.3 if they come every 60 s, 30 s apart."""
+"""Maximum variance of the current at the times of the voltages, as a fraction of its mean square, for a fit. An error of the
+current makes the fitted resistances too small by about this fraction, because least squares assume exact currents. The error of
+the resistances then distorts OCV and capacity. The fraction is 0.02 for a load that changes every 20 s if voltage and current
+come every 10 s, 5 s apart, and 0.2 to 0.3 if they come every 60 s, 30 s apart."""
 MIN_THROUGHPUT_SOC = 1.0
 """Minimum throughput of the history for the adoption of a fit with a large std of the SOC [SOC]. In a shorter history several
 separate SOCs may be possible, which the filter's hypotheses represent and the single normal distribution of a fit does not."""
@@ -83,7 +83,7 @@ class SlowFit:
         estimator: Estimator of a battery with the identifier enabled; its history is switched on.
         submit: Runs a fit, for example in another thread, and returns its future.
         interval_s: Maximum interval between two fits, on the clock of the samples [s]. A history that is younger than
-            ``interval_s / INTERVAL_OF_AGE`` is fitted more often. Infinite: no fits.
+            ``interval_s / INTERVAL_PER_AGE`` is fitted more often. Infinite: no fits.
         on_failure: Called with an exception in a fit or in the processing of rows. The previous fit stays in use.
 
     Attributes:
@@ -127,7 +127,7 @@ class SlowFit:
     def advance(self) -> None:
         """Take completed rows, and begin or end a fit that is due. Call it each time ``Estimator.run_part`` stops."""
         self.take_rows()
-        if self._h["elapsed_s"] >= self._h["event_s"]:
+        if self._history_state["elapsed_s"] >= self._history_state["event_s"]:
             self._handle_event()
 
     def load(self, history: History, fit: PackFit | None, state_fit: PackFit | None) -> None:
@@ -158,7 +158,7 @@ class SlowFit:
 
     def _schedule_after_restart(self, *, restored: bool) -> None:
         """Set the time of the next event. If the state does not contain the saved fit, this event adopts it like a new fit."""
-        h, saved = self._h, self.saved_fit
+        h, saved = self._history_state, self.saved_fit
         fitted_s = -math.inf if saved is None else saved.elapsed_s
         self._new_rows = int((self.history.rows["elapsed_s"] > fitted_s).sum())
         next_s = float(h["event_s"]) if restored else math.inf
@@ -224,22 +224,22 @@ class SlowFit:
 
     @property
     def weak_cell_std(self) -> float:
-        """Significance of a weak cell in the last comparison of a bank [std]; NaN without one."""
+        """Significance of a weak cell in the last comparison of a bank [std]; NaN before a comparison."""
         return self.bank.weakest.deviation_std if self.bank and self.bank.weakest else math.nan
 
     @property
-    def _h(self) -> np.void:
+    def _history_state(self) -> np.void:
         """Recording of the history in the estimator's state, a record of HISTORY."""
         record: np.void = self.estimator.record[0]["history"]
         return record
 
     def interval(self) -> float:
         """Return the interval until the next fit [s]; infinite if there are no fits."""
-        return fit_interval(float(self._h["elapsed_s"]), self._interval_s)
+        return fit_interval(float(self._history_state["elapsed_s"]), self._interval_s)
 
     def _handle_event(self) -> None:
         """Begin a fit, or end a pending one, at the time ``event_s`` of the record of the history."""
-        h = self._h
+        h = self._history_state
         if self._pending is None:
             self._begin_fit()
         elif self._pending.done():
@@ -252,7 +252,7 @@ class SlowFit:
 
     def _begin_fit(self) -> None:
         """Begin a fit if there is enough new data with known currents, and set the time of the next event."""
-        h = self._h
+        h = self._history_state
         rows, previous = self.history.rows, self.saved_fit
         if has_enough_data(rows, self._new_rows, previous):
             self._new_rows, self._fitted_rows = 0, rows
@@ -296,7 +296,7 @@ def fit_interval(elapsed_s: float, interval_s: float) -> float:
         elapsed_s: Age of the history [s].
         interval_s: Maximum interval [s]; infinite: no fits.
     """
-    return interval_s if math.isinf(interval_s) else min(max(INTERVAL_OF_AGE * elapsed_s, MIN_INTERVAL_S), interval_s)
+    return interval_s if math.isinf(interval_s) else min(max(INTERVAL_PER_AGE * elapsed_s, MIN_INTERVAL_S), interval_s)
 
 
 def has_enough_data(rows: NDArray[np.void], new_rows: int, previous: PackFit | None) -> bool:
@@ -310,11 +310,11 @@ def has_enough_data(rows: NDArray[np.void], new_rows: int, previous: PackFit | N
     min_rows = float(MIN_ROWS)
     if previous is not None and previous.covariance[FIT_SOC, FIT_SOC] <= MAX_CERTAIN_STD**2:
         min_rows = max(min_rows, MIN_GROWTH * rows.size)
-    return new_rows >= min_rows and unknown_current(rows) <= MAX_UNKNOWN_CURRENT
+    return new_rows >= min_rows and unknown_current_fraction(rows) <= MAX_UNKNOWN_CURRENT
 
 
 def min_filter_std(fitted: PackFit, rows: NDArray[np.void]) -> float:
-    """Return the std of the filter's SOC from which on a fit is adopted: 0 always, infinite never.
+    """Return the minimum std of the filter's SOC for the adoption of a fit; 0: always, infinite: never.
 
     A fit is always adopted if one normal distribution represents the SOC: its std is small, or the history is long. In a short
     history with a known SOC or a gap the fit may know more than the filter, which learns neither capacity nor OCV from an end of
@@ -332,7 +332,7 @@ def min_filter_std(fitted: PackFit, rows: NDArray[np.void]) -> float:
     return std if is_known or has_gap else math.inf
 
 
-def unknown_current(rows: NDArray[np.void]) -> float:
+def unknown_current_fraction(rows: NDArray[np.void]) -> float:
     """Return the variance of the current at the times of the voltages, divided by its mean square; 0 without a current.
 
     Args:

@@ -1,4 +1,4 @@
-"""Damped Gauss-Newton (Levenberg-Marquardt) minimization of the cost of the slow fit, which fits a model of the pack to weeks of data."""
+"""Damped Gauss-Newton (Levenberg-Marquardt) minimization of the cost of the slow fit of the pack's model to its history."""
 
 import threading
 from collections.abc import Iterator, Sequence
@@ -17,19 +17,19 @@ MAX_ITERATIONS = 30
 """Maximum number of steps from one start."""
 MAX_STEP_SOC = 0.15
 """Maximum change of an SOC in one step, because the curves are not linear over a longer one."""
-CONVERGED = 0.02
-"""The minimization ends when a step lowers the cost by less than this."""
+MIN_DECREASE = 0.02
+"""Decrease of the cost in one step below which the minimization ends."""
 SAME_COST, SAME_SOC = 0.3, 0.01
 """Differences of cost and SOC below which two minima count as one. They exceed the differences that an unfinished minimization
-leaves (``CONVERGED``)."""
+leaves (``MIN_DECREASE``)."""
 FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-9, 1e6
 """Relative damping of the diagonal at the start, and its limits."""
 LESS_DAMPING, MORE_DAMPING = 0.2, 8.0
 """Factors on the damping after a step that lowers the cost, and after a step that does not."""
 
 _ONE_FIT = threading.Lock()
-"""Lock of the number of BLAS threads, a setting of the process: the first of two concurrent fits to end would restore it under the
-other."""
+"""Lock for one fit at a time. The number of BLAS threads is a setting of the process, and the first of two concurrent fits to end
+would reset it during the other."""
 
 
 @contextmanager
@@ -52,9 +52,9 @@ class Minimum:
     factor: Floats
     """Lower Cholesky factor of the inverse of the unknowns' covariance (Laplace approximation)."""
 
-    def covariance_of(self, select: Floats) -> Floats:
-        """Return the covariance of ``select`` @ x."""
-        half = np.array([forward_substitution(self.factor, row) for row in select])
+    def covariance_of(self, matrix: Floats) -> Floats:
+        """Return the covariance of ``matrix`` @ x."""
+        half = np.array([forward_substitution(self.factor, row) for row in matrix])
         return np.asarray(half @ half.T)
 
 
@@ -67,7 +67,7 @@ def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ())
         decrease = now.cost - trial.cost
         if decrease > 0.0:
             now, damping = trial, max(LESS_DAMPING * damping, MIN_DAMPING)
-            if decrease < CONVERGED:
+            if decrease < MIN_DECREASE:
                 break
             normal = equations.normal_equations(now)
         else:
@@ -97,16 +97,17 @@ def step(normal: NormalEquations, damping: float, u: Unknowns) -> Floats:
     return full * min(1.0, MAX_STEP_SOC / largest) if largest > 0.0 else full
 
 
-def cholesky(a: Floats, sparse: int) -> Floats:
+def cholesky(a: Floats, sparse_count: int) -> Floats:
     """Return the lower Cholesky factor of a symmetric matrix. The upper triangle of the result is meaningless.
 
     Args:
         a: Matrix, of which only the lower triangle is read; overwritten.
-        sparse: Number of first columns with few non-zero elements: those of the unknowns of single segments, before the SOCs.
+        sparse_count: Number of first columns with few non-zero elements: those of the unknowns of single segments, before the
+            SOCs.
 
     Raises:
         numpy.linalg.LinAlgError: The matrix is not positive definite, or not finite.
     """
-    eliminate_sparse(a, sparse)
-    a[sparse:, sparse:] = np.linalg.cholesky(a[sparse:, sparse:])
+    eliminate_sparse(a, sparse_count)
+    a[sparse_count:, sparse_count:] = np.linalg.cholesky(a[sparse_count:, sparse_count:])
     return a

@@ -42,7 +42,7 @@ class Unknowns:
     entropy: slice
     """Error of the OCV's temperature coefficient [V/K]."""
     arrhenius: slice
-    """Error of the relative change of the resistances by temperature [1/K]."""
+    """Error of the relative change of the resistances with temperature [1/K]."""
     full: slice
     """1 minus the SOC at which this pack's charger ends."""
     curve: slice

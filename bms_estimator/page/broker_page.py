@@ -28,25 +28,25 @@ async def dashboard(broker: MqttSettings, settings: PageSettings, folder: Path) 
     Raises:
         UserError: A setting cannot be used, or the address is in use.
     """
-    hub, history = PackTopics(), HistoryQuery()
-    hub.set_link_state(f"{', '.join(broker.urls)}: not reached yet")
+    pack_topics, history = PackTopics(), HistoryQuery()
+    pack_topics.set_link_state(f"{', '.join(broker.urls)}: not reached yet")
 
     def on_message(message: DeviceMessage) -> None:
-        if message.device not in hub.packs:
+        if message.device not in pack_topics.packs:
             history.add(message.device, folder / f"{message.device}.sqlite")
-        hub.put(*message)
-        hub.set_hidden_count(subscriber.hidden)
+        pack_topics.put(*message)
+        pack_topics.set_hidden_count(subscriber.hidden)
 
     def on_hidden(device: str) -> None:
-        hub.drop(device)
+        pack_topics.drop(device)
         history.drop(device)
-        hub.set_hidden_count(subscriber.hidden)
+        pack_topics.set_hidden_count(subscriber.hidden)
 
     def on_link_change() -> None:
         lost = subscriber.lost_since is not None
-        hub.set_link_state(subscriber.trouble or "the broker is lost" if lost else None)
+        pack_topics.set_link_state(subscriber.trouble or "the broker is lost" if lost else None)
 
-    async with PageServer(settings, hub, history, retry=False) as server:
+    async with PageServer(settings, pack_topics, history, retry=False) as server:
         subscriber = Subscriber(broker, on_message, on_link_change, on_hidden=on_hidden)
         async with subscriber:
             yield server.url

@@ -90,9 +90,9 @@ class Reader:
         self._has_news.set()
 
     async def next(self, timeout_s: float) -> str:
-        """Return the waiting texts as one JSON object of at most ``MAX_MESSAGE_BYTES``, or of one text if that is longer.
+        """Return waiting texts as one JSON object. Only a single text may be longer than ``MAX_MESSAGE_BYTES``.
 
-        The rest waits for the next call. The result is empty after ``timeout_s`` without a change, or at the end.
+        The others wait for the next call. The result is empty after ``timeout_s`` without a change, or when the stream ends.
         """
         try:
             async with asyncio.timeout(timeout_s):

@@ -86,7 +86,7 @@ class HistoryQuery:
 
 
 def _query_columns(file: HistoryReader, span: Span, now_s: float) -> bytes:
-    # with a margin, because the samples may have a clock of their own
+    # the margin accepts samples whose clock is ahead
     since_s, until_s = now_s - span.length_s, now_s + MINUTE_S
     rows = file.rows(since_s, until_s, span.step_s)
     events = file.events(since_s, until_s)[-MAX_EVENTS:]

@@ -12,7 +12,7 @@ from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.store.history import epoch_s
 
 PACKS = "packs"
-"""Key of the names of all packs and of the number of packs that are not shown."""
+"""Key of the names of all packs and of the number of hidden packs, which are more than the page can show."""
 STATE, PARAMETERS, EVENT, RECENT, ELEMENTS = "state", "parameters", "event", "recent", "elements"
 """Topics of state, parameters and events, and two keys that exist only here: recent states, and elements over SOC."""
 SHOWN_TOPICS = frozenset(
@@ -26,14 +26,13 @@ RECENT_STATES = 600
 RECENT_EVENTS = 50
 """Maximum number of stored events of a pack, as many as the page lists."""
 MAX_EVENT_CHARACTERS = 4096
-"""Maximum length of a stored event, which only another publisher exceeds."""
+"""Maximum length of a stored event [characters]. Only events of other publishers are longer."""
 RECENT_STEP_S = 1.0
 """Minimum interval of the states that are stored for the curves of a new reader [s]."""
-MAX_AHEAD_S = 86_400.0
+MAX_LEAD_S = 86_400.0
 """Maximum lead of a state's time over the wall clock [s]. A state with a larger lead is ignored."""
-SET_BACK_S = 60.0
-"""Maximum lead of a stored state over both the wall clock and the next state [s]. A state with a larger lead is removed,
-because its clock was wrong."""
+MAX_STORED_LEAD_S = 60.0
+"""A stored state that leads the wall clock and the next state by more than this [s] is removed: its clock was wrong."""
 RECENT_FIELDS = ("voltage_v", "voltage_estimate_v", "current_a", "power_w", "soc", "soc_std", "innovation_v")
 
 _STORED_FIELDS = {STATE: {"time", *RECENT_FIELDS}, PARAMETERS: {"soc", "elements"}}
@@ -69,7 +68,7 @@ class PackTopics(LatestValues):
         Args:
             pack: Name of the pack.
             topic: Topic relative to that of the pack.
-            value: Payload, whose JSON is shown as it is; parsed JSON, or text; None: the topic was cleared.
+            value: A ``Payload``, parsed JSON or text; None: the topic was cleared.
         """
         if topic not in SHOWN_TOPICS and not topic.startswith(ALARM):
             return
@@ -152,10 +151,10 @@ class PackTopics(LatestValues):
             time_s, values = epoch_s(state["time"]), tuple(_number(state.get(field)) for field in RECENT_FIELDS)
         except (TypeError, ValueError, KeyError):  # invalid, from another publisher
             return
-        if time_s > self._wall() + MAX_AHEAD_S:  # it would hide all later states
+        if time_s > self._wall() + MAX_LEAD_S:  # it would hide all later states
             return
         rows = self._recent.setdefault(pack, deque(maxlen=RECENT_STATES))
-        while rows and rows[-1][0] > max(time_s, self._wall()) + SET_BACK_S:
+        while rows and rows[-1][0] > max(time_s, self._wall()) + MAX_STORED_LEAD_S:
             rows.pop()
         if not rows or time_s >= rows[-1][0] + RECENT_STEP_S:
             rows.append((time_s, values))

@@ -46,7 +46,7 @@ FILES = {
 }
 """Static files by URL path."""
 
-Forecast = Callable[[bytes], Awaitable[bytes | None]]
+ForecastHandler = Callable[[bytes], Awaitable[bytes | None]]
 """Function that answers the payload of a request ``forecast``; None: too many requests."""
 
 
@@ -55,10 +55,10 @@ class PageServer(WebServer):
 
     Args:
         settings: Address and access of the page.
-        hub: Present state of the packs.
+        pack_topics: Present state of the packs.
         history: History of the packs.
         forecasts: Functions that answer requests for a forecast, by pack. The caller may add and remove packs.
-        on_listening: Called with the address of the page once the server listens.
+        on_listening: Called with the address of the page once the server listens; ``str`` ignores it.
         retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
     Raises:
@@ -68,9 +68,9 @@ class PageServer(WebServer):
     def __init__(
         self,
         settings: PageSettings,
-        hub: PackTopics,
+        pack_topics: PackTopics,
         history: HistoryQuery,
-        forecasts: Mapping[str, Forecast] = MappingProxyType({}),
+        forecasts: Mapping[str, ForecastHandler] = MappingProxyType({}),
         *,
         on_listening: Callable[[str], object] = str,
         retry: bool = True,
@@ -78,7 +78,7 @@ class PageServer(WebServer):
         super().__init__(
             settings,
             FILES,
-            hub,
+            pack_topics,
             {"/history": self._answer_history},
             forms={"/forecast": self._answer_forecast},
             max_form_bytes=MAX_READ_BYTES,

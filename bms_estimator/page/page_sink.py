@@ -1,4 +1,4 @@
-"""Sink that shows a service's packs on the page, by the payloads of MQTT. Packs with one address share a server."""
+"""Sink that shows a service's packs on the page, from the payloads of MQTT. Packs with one address share a server."""
 
 import asyncio
 import contextlib
@@ -11,7 +11,7 @@ from bms_estimator.model.events import events
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import EVENT, STATE, PackTopics
-from bms_estimator.page.page_server import Forecast, PageServer
+from bms_estimator.page.page_server import ForecastHandler, PageServer
 from bms_estimator.settings.page import PageSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, changed_payloads
 
@@ -33,37 +33,37 @@ class PageSink:
         settings: PageSettings,
         pack: str,
         history: Path | None = None,
-        forecast: Forecast | None = None,
+        forecast: ForecastHandler | None = None,
     ) -> None:
         self._pages, self._settings, self._pack, self._history = pages, settings, pack, history
         self._forecast = forecast
         self._previous: Snapshot | None = None
-        self._hub = PackTopics()
+        self._pack_topics = PackTopics()
         self._stack = contextlib.AsyncExitStack()
 
     async def __aenter__(self) -> Self:
         """Start to serve the page."""
-        self._hub = await self._stack.enter_async_context(
+        self._pack_topics = await self._stack.enter_async_context(
             self._pages.serving(self._settings, self._pack, self._history, self._forecast)
         )
-        self._hub.put(self._pack, AVAILABILITY, "online")
+        self._pack_topics.put(self._pack, AVAILABILITY, "online")
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Close the streams of all browsers."""
+        """Set the pack offline. The last pack of an address ends its server."""
         for topic in (SENSOR_AVAILABILITY, AVAILABILITY):
-            self._hub.put(self._pack, topic, "offline")
+            self._pack_topics.put(self._pack, topic, "offline")
         await self._stack.aclose()
 
     def publish(self, snapshot: Snapshot) -> None:
         """Store a snapshot for the page, without blocking."""
         for event in events(self._previous, snapshot):
-            self._hub.put(self._pack, EVENT, event)
+            self._pack_topics.put(self._pack, EVENT, event)
         if snapshot.estimate:
-            self._hub.put(self._pack, STATE, snapshot.estimate)
+            self._pack_topics.put(self._pack, STATE, snapshot.estimate)
         for topic, payload in changed_payloads(self._previous, snapshot):
-            self._hub.put(self._pack, topic, payload)
-        self._hub.put(self._pack, SENSOR_AVAILABILITY, "online" if snapshot.health.sensor_online else "offline")
+            self._pack_topics.put(self._pack, topic, payload)
+        self._pack_topics.put(self._pack, SENSOR_AVAILABILITY, "online" if snapshot.health.sensor_online else "offline")
         self._previous = snapshot
 
 
@@ -80,7 +80,7 @@ class Pages:
 
     @contextlib.asynccontextmanager
     async def serving(
-        self, settings: PageSettings, pack: str, history: Path | None, forecast: Forecast | None
+        self, settings: PageSettings, pack: str, history: Path | None, forecast: ForecastHandler | None
     ) -> AsyncIterator[PackTopics]:
         """Show a pack. The first pack starts the server of its address, the last one ends it.
 
@@ -99,7 +99,7 @@ class Pages:
             if forecast:
                 page.forecasts[pack] = forecast
             await page.start()
-            yield page.hub
+            yield page.pack_topics
         finally:
             page.packs -= 1
             page.forecasts.pop(pack, None)
@@ -113,12 +113,18 @@ class _Page:
 
     def __init__(self, settings: PageSettings, on_listening: Callable[[str], object]) -> None:
         self.settings, self.packs = settings, 0
-        self.hub, self.history_query, self.forecasts = PackTopics(), HistoryQuery(), dict[str, Forecast]()
-        self._server = PageServer(settings, self.hub, self.history_query, self.forecasts, on_listening=on_listening)
+        self.pack_topics, self.history_query, self.forecasts = (
+            PackTopics(),
+            HistoryQuery(),
+            dict[str, ForecastHandler](),
+        )
+        self._server = PageServer(
+            settings, self.pack_topics, self.history_query, self.forecasts, on_listening=on_listening
+        )
         self._start_task: asyncio.Task[PageServer] | None = None
 
     async def start(self) -> None:
-        """Start the server, unless an earlier pack started it."""
+        """Start the server, unless an earlier pack started it. The cancellation of one pack does not cancel the start."""
         if self._start_task is None:
             self._start_task = asyncio.ensure_future(self._server.__aenter__())
         await asyncio.shield(self._start_task)

@@ -19,7 +19,7 @@ from bms_estimator.process.listener import CONNECTIONS, Listener
 from bms_estimator.settings.page import PageSettings
 
 PING_S = 5.0
-"""Interval of keep-alive events to a silent reader [s]; the page counts the connection as lost after three of them."""
+"""Interval of keep-alive events without news [s]. The page counts the connection as lost after three intervals of silence."""
 WRITE_S = 30.0
 """Time without progress after which a reader is disconnected [s]."""
 MAX_STREAMS = 32
@@ -72,7 +72,7 @@ class WebServer:
         forms: Handlers of submitted forms, by path.
         max_form_bytes: Maximum size of a submitted form [bytes].
         token: Required token if the settings name no file with one; None: no token is required.
-        on_listening: Called with the address once the server listens.
+        on_listening: Called with the address once the server listens; ``str`` ignores it.
         retry: True: retry an address that is in use or does not exist yet; False: raise an error.
 
     Raises:
@@ -94,9 +94,9 @@ class WebServer:
     ) -> None:
         self._latest, self._on_listening, self._retry = latest, on_listening, retry
         self._access: AccessControl = make_access_control(settings, token)
-        self._configured_address, self._listening = settings.address, settings.address
+        self._configured_address, self._bound_address = settings.address, settings.address
         self._files = {path: _load_file(file) for path, file in files.items()}
-        self._handlers = {**dict.fromkeys(files, self._file), "/events": self._stream_events, **handlers}
+        self._handlers = {**dict.fromkeys(files, self._send_file), "/events": self._stream_events, **handlers}
         self._forms, self._max_form_bytes = forms, max_form_bytes
         self._streams: dict[Reader, _Stream] = {}
         self._runner: web.AppRunner | None = None
@@ -105,7 +105,7 @@ class WebServer:
     @property
     def url(self) -> str:
         """Address at which a browser on this machine finds the page."""
-        host, port = self._listening
+        host, port = self._bound_address
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104 - configured, and with a token only
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
@@ -116,7 +116,7 @@ class WebServer:
             UserError: The address cannot be listened on, and ``retry`` is False.
         """
         app = web.Application(middlewares=[self._exempt_connection], client_max_size=self._max_form_bytes)
-        app.on_response_prepare.append(_protect)
+        app.on_response_prepare.append(_set_security_headers)
         for path, handler in self._handlers.items():
             app.router.add_get(path, handler)
         for path, handler in self._forms.items():
@@ -144,13 +144,13 @@ class WebServer:
             await self._runner.cleanup()
 
     def _on_open(self, port: int) -> None:
-        self._listening = self._configured_address._replace(port=port)
+        self._bound_address = self._configured_address._replace(port=port)
         log.info("live page", url=self.url)
         self._on_listening(self.url)
 
     @web.middleware
     async def _exempt_connection(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Exempt the connection from displacement while its request is handled."""
+        """Prevent that a new connection displaces this one while its request is handled."""
         with CONNECTIONS.serving(request.transport):
             return await self._authorize(request, handler)
 
@@ -162,24 +162,24 @@ class WebServer:
         if token is not None and self._access.is_valid_token(token):
             return self._set_cookie()
         authorization = request.headers.get("Authorization", "")
-        if self._access.is_valid_cookie(request.cookies.get(self._cookie, "")):
+        if self._access.is_valid_cookie(request.cookies.get(self._cookie_name, "")):
             return await handler(request)
         if authorization.startswith("Bearer ") and self._access.is_valid_token(authorization.removeprefix("Bearer ")):
             return await handler(request)
         raise web.HTTPUnauthorized(text=LOGIN_PAGE, content_type="text/html", headers={"WWW-Authenticate": "Bearer"})
 
     @property
-    def _cookie(self) -> str:
+    def _cookie_name(self) -> str:
         """Name of the cookie. It contains the port, because browsers share cookies between the ports of a host."""
-        return f"bms_page_{self._listening.port}"
+        return f"bms_page_{self._bound_address.port}"
 
     def _set_cookie(self) -> web.Response:
         """Set the cookie, and redirect to the address without the token."""
         response = web.Response(status=303, headers={"Location": "/"})
-        response.set_cookie(self._cookie, self._access.cookie, max_age=COOKIE_S, httponly=True, samesite="Strict")
+        response.set_cookie(self._cookie_name, self._access.cookie, max_age=COOKIE_S, httponly=True, samesite="Strict")
         return response
 
-    async def _file(self, request: web.Request) -> web.StreamResponse:
+    async def _send_file(self, request: web.Request) -> web.StreamResponse:
         file = self._files[request.path]
         headers = {"ETag": file.etag, "Cache-Control": "no-cache"}
         if request.headers.get("If-None-Match") == file.etag:
@@ -229,7 +229,7 @@ class WebServer:
             transport.abort()  # its reader may be waiting for a client that reads nothing
 
 
-async def _protect(_: web.Request, response: web.StreamResponse) -> None:
+async def _set_security_headers(_: web.Request, response: web.StreamResponse) -> None:
     response.headers.update(HEADERS)
     response.headers.pop("Server", None)
 

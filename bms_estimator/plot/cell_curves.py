@@ -74,8 +74,8 @@ def rc_product(cell: CellModel, pair: str, estimates: Mapping[str, Floats] | Non
         estimates: Columns of the result of ``estimate``; None: only the cell's curve.
         ax: Axes; None: a new figure is created.
     """
-    ohm, farad, label = PAIRS[pair]
-    curve = np.array([ohm(x, cell.a[:16]) * farad(x, cell.a[:16]) for x in SOC_GRID])
+    resistance, capacitance, label = PAIRS[pair]
+    curve = np.array([resistance(x, cell.a[:16]) * capacitance(x, cell.a[:16]) for x in SOC_GRID])
     estimated = None if estimates is None else over_soc(estimates, f"tau_{pair}_s", f"tau_{pair}_std_s")
     ax = _draw_over_soc(ax or new_axes(), curve, estimated, 1.0)
     ax.set(ylabel=label)
@@ -121,7 +121,7 @@ def ocv_residuals(cell: CellModel, soc: Floats, residual_v: Floats, *, ax: Any =
         ax.legend()
     ax.axhline(0.0, color=FAINT, linewidth=0.8)
     ax.plot(100.0 * soc, 1e3 * residual_v, "o", color=COLORS[1], markersize=3.5)
-    limit_mv = 1.3e3 * float(np.abs(residual_v).max(initial=1e-3))
+    limit_mv = 1.3e3 * float(np.abs(residual_v).max(initial=1e-3))  # with a margin of 30 %
     ax.set(xlabel="SOC [%]", ylabel="rests minus OCV [mV]", ylim=(-limit_mv, limit_mv))
     return ax
 
@@ -144,10 +144,12 @@ def element_over_soc(estimates: Mapping[str, Floats], name: str) -> SocCurve:
     if name.startswith("r_"):
         return over_soc(estimates, f"{name}_ohm", f"{name}_std_ohm")
     pair = name.removeprefix("c_")
-    ohm = over_soc(estimates, f"r_{pair}_ohm", f"r_{pair}_std_ohm")
+    resistance = over_soc(estimates, f"r_{pair}_ohm", f"r_{pair}_std_ohm")
     tau = over_soc(estimates, f"tau_{pair}_s", f"tau_{pair}_std_s")
-    farad = tau.value / ohm.value
-    return SocCurve(ohm.soc, farad, farad * np.hypot(tau.std / tau.value, ohm.std / ohm.value))
+    capacitance = tau.value / resistance.value
+    return SocCurve(
+        resistance.soc, capacitance, capacitance * np.hypot(tau.std / tau.value, resistance.std / resistance.value)
+    )
 
 
 def over_soc(estimates: Mapping[str, Floats], value: str, std: str) -> SocCurve:

@@ -31,7 +31,7 @@ MAX_DAYS = 62
 WH_PER_KWH = 1000.0
 """Watt-hours in a kilowatt-hour. The table is in kWh if a day has at least one."""
 MIN_FOR_ONE_DECIMAL = 1.0
-"""Largest value from which a column has one decimal, otherwise three [A, Ah, Wh or kWh]."""
+"""A column whose largest value is at least this has one decimal, otherwise three [A, Ah, Wh or kWh]."""
 CHARGES, ENERGIES = ("charge_out_ah", "charge_in_ah"), ("energy_out_wh", "energy_in_wh")
 """Columns that are summed."""
 
@@ -42,10 +42,10 @@ def day_table(history: ColumnsByName) -> Group:
     """Return the table of the last days.
 
     Args:
-        history: Columns of ``store.minute.Minute`` by name, each of shape (n,); NaN where a value is missing.
+        history: Columns of ``store.history.Minute`` by name, each of shape (n,); NaN where a value is missing.
     """
-    number = np.floor(history["time_s"] / DAY_S).astype(np.int64)
-    days = [{name: values[number == day] for name, values in history.items()} for day in np.unique(number)[-MAX_DAYS:]]
+    day_of = np.floor(history["time_s"] / DAY_S).astype(np.int64)
+    days = [{name: values[day_of == day] for name, values in history.items()} for day in np.unique(day_of)[-MAX_DAYS:]]
     charges_ah, energies_wh = _sums(days, CHARGES), _sums(days, ENERGIES)
     unit, unit_wh = ("kWh", WH_PER_KWH) if energies_wh.max() >= WH_PER_KWH else ("Wh", 1.0)
     largest_a = np.abs([history["current_min_a"], history["current_max_a"]]).max()
@@ -119,7 +119,7 @@ class PackHistory:
         pack: Name of the pack.
         time_s: Shape (n,), start of each minute [s since 1970], increasing. A minute that passed twice, because the clock was
             set back, has a second row some seconds later.
-        columns: Columns of ``store.minute.Minute`` by name, each of shape (n,); NaN where a value is missing.
+        columns: Columns of ``store.history.Minute`` by name, each of shape (n,); NaN where a value is missing.
         events: Time [s since 1970], name and text of each event, oldest first.
         learned: Name, value and std of each learned parameter in the last checkpoint; empty without a checkpoint.
         not_learned: Reason why there are no learned parameters; empty if there are some.
@@ -207,7 +207,7 @@ def _draw_soc(history: PackHistory, ax: Any) -> None:
 def _draw_range(
     quantity: str, unit: str, label: str, min_span: float, color: str
 ) -> Callable[[PackHistory, Any], None]:
-    """Return the function that draws the mean of a quantity with the band of its extremes, on an axis of at least ``min_span``."""
+    """Return a function that draws the mean of a quantity with the band of its extremes, on an axis of at least ``min_span``."""
 
     def draw(history: PackHistory, ax: Any) -> None:
         mean, low, high = (history.columns[f"{quantity}_{part}{unit}"] for part in ("", "min_", "max_"))

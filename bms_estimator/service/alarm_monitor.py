@@ -10,7 +10,7 @@ import structlog
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.health import HookHealth
-from bms_estimator.pack.pack import Pack, Step
+from bms_estimator.pack.pack import Pack, RunResult
 from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
@@ -71,7 +71,7 @@ class AlarmMonitor:
         self._evaluated_s = -math.inf
         self._is_stopped = False
 
-    def add(self, received: ReceivedSamples, step: Step, now_s: float, cells_fault: str = "") -> bool:
+    def add(self, received: ReceivedSamples, step: RunResult, now_s: float, cells_fault: str = "") -> bool:
         """Evaluate the alarms on received samples and their estimates; report changes if this is due.
 
         Args:

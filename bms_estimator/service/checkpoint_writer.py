@@ -83,7 +83,7 @@ class CheckpointWriter:
         self._discarded = 0  # number of histories whose files were quarantined
         self._saved_counters: RunCounters | None = None
         """Counters and alarms of the last save; None before the first save of this run."""
-        status.saved_flow = totals.flow
+        status.saved_flow = totals.charge_energy
         self._saved_fit = self._fit  # fit of the saved state
         self._saved_progress: tuple[int, float] | None = None
         """Samples and SOC (``_progress``) of the last saved state; None: this run has not saved a state."""

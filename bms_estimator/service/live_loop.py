@@ -247,7 +247,7 @@ async def _estimate(
         if slots.moved:
             publisher.alarm_monitor.raise_state_lost(slots.moved)
         now_s = since_boot()
-        pack.waited(now_s - before_s)
+        pack.extend_gap(now_s - before_s)
         before_s = now_s
         if edge:
             edge.take(received.samples, received.cells_v)

@@ -10,7 +10,7 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealth
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info, Snapshot
-from bms_estimator.pack.pack import Pack, Step
+from bms_estimator.pack.pack import Pack, RunResult
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.service_status import Latency, ServiceStatus
 from bms_estimator.settings.alarm_limits import short_limit_a
@@ -120,7 +120,7 @@ class Publisher:
         """Return the time until a snapshot is overdue, which shows that no samples arrive [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
-    def add(self, received: ReceivedSamples, step: Step, cells_fault: str = "") -> None:
+    def add(self, received: ReceivedSamples, step: RunResult, cells_fault: str = "") -> None:
         """Add received samples and their estimates; publish if a snapshot is due or an alarm has changed.
 
         Args:
@@ -131,7 +131,7 @@ class Publisher:
         self.add_estimates(received, step)
         self.add_to_alarms(received, step, cells_fault)
 
-    def add_estimates(self, received: ReceivedSamples, step: Step) -> bool:
+    def add_estimates(self, received: ReceivedSamples, step: RunResult) -> bool:
         """Do the first part of ``add``. Return True if it has published a snapshot.
 
         The alarms follow in ``add_to_alarms``, so that their evaluation does not delay the estimate. The first snapshot follows
@@ -153,7 +153,7 @@ class Publisher:
         self._publish_snapshot(now_s)
         return True
 
-    def add_to_alarms(self, received: ReceivedSamples, step: Step, cells_fault: str = "") -> None:
+    def add_to_alarms(self, received: ReceivedSamples, step: RunResult, cells_fault: str = "") -> None:
         """Do the second part of ``add``, after ``add_estimates``."""
         now_s = self._clock.monotonic()
         alarm_changed = self.alarm_monitor.add(received, step, now_s, cells_fault)
@@ -251,7 +251,7 @@ class Publisher:
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         # only saved values, so that the next run continues from there
-        self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
+        self._flow = self._flow.at_least(self._status.saved_flow or self._totals.charge_energy)
         capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:

@@ -16,7 +16,7 @@ import structlog
 from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.store.migrations import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
 
-HANG_S = 10.0
+DISK_TIMEOUT_S = 10.0
 """Timeout after which the disk counts as hung [s]."""
 SHUTDOWN_TIMEOUT_S = 5.0
 """Timeout of all writes during shutdown [s]."""
@@ -49,7 +49,7 @@ class StoreError(Exception):
 
 
 class Database:
-    """Runs transactions one after the other, in a new file if the existing file is unusable.
+    """Database that runs one transaction at a time. It replaces an unusable file by a new one.
 
     The caller repeats the work of a failed transaction in a later transaction.
 
@@ -57,11 +57,11 @@ class Database:
         path: Database file, created if missing.
         tables: Statements that create the tables, in the format of ``MIGRATIONS``.
         sync_s: Minimum interval between two fsyncs [s].
-        hang_s: Timeout of a transaction [s].
+        disk_timeout_s: Timeout of a transaction [s].
         retry_s: Delay after a failure before the disk is retried [s].
 
     Attributes:
-        reason: Reason for which the database is unavailable; empty while it is available.
+        reason: Reason why the database is unavailable; empty while it is available.
     """
 
     def __init__(
@@ -70,11 +70,11 @@ class Database:
         *,
         tables: tuple[str, ...] = MIGRATIONS,
         sync_s: float = SYNC_S,
-        hang_s: float = HANG_S,
+        disk_timeout_s: float = DISK_TIMEOUT_S,
         retry_s: float = RETRY_S,
     ) -> None:
         self.path, self.reason = path, ""
-        self._hang_s, self._retry_s = hang_s, retry_s
+        self._disk_timeout_s, self._retry_s = disk_timeout_s, retry_s
         self._thread = DaemonThreadExecutor("database")
         self._hung_call: asyncio.Future[Any] | None = None
         self._last_failure_s = -retry_s
@@ -100,7 +100,7 @@ class Database:
 
     async def _wait(self, waiter: asyncio.Future[Any]) -> bool:
         """Return True if the disk responded in time."""
-        due_s = min(asyncio.get_running_loop().time() + self._hang_s, self._shutdown_end_s)
+        due_s = min(asyncio.get_running_loop().time() + self._disk_timeout_s, self._shutdown_end_s)
         try:
             async with asyncio.timeout_at(due_s) as timeout:
                 self._open_timeouts.add(timeout)
@@ -166,7 +166,7 @@ class _File:
     def run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run one transaction, in a new file if the existing one is unusable."""
         try:
-            return self._run(work)
+            return self._run_once(work)
         except (NewerVersionError, OtherTablesError) as error:
             self._quarantine(str(error))
         except UnicodeDecodeError as error:  # SQLite's error messages quote names of damaged tables
@@ -175,7 +175,7 @@ class _File:
             self._quarantine(str(error))
         except sqlite3.DatabaseError as error:
             code = getattr(error, "sqlite_errorcode", 0)
-            # plain READONLY comes from the file's header and not from permissions: the file was just opened for writing
+            # READONLY without an extended code comes from the file's header, because the file was just opened for writing
             # the lowest byte of an extended code is the primary code
             unusable = code == sqlite3.SQLITE_READONLY or code & 0xFF in (
                 UNUSABLE_CODES if self._ready else UNUSABLE_CODES_AT_OPEN
@@ -183,9 +183,9 @@ class _File:
             if not unusable:
                 raise
             self._quarantine(str(error))
-        return self._run(work)
+        return self._run_once(work)
 
-    def _run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
+    def _run_once(self, work: Callable[[sqlite3.Connection], Result]) -> Result:
         """Run one transaction; open the file if necessary, and close it after an error."""
         try:
             connection = self._open()

@@ -1,7 +1,7 @@
 """History of a pack: one-minute rows and events, for the configured number of days.
 
-A row has means, extremes and sums of the publications of a minute. Four minutes are written in one transaction, and an event at once or ``WRITE_S`` after the previous transaction, outside the
-event loop. ``kill -9`` loses the open minute and what is not written yet.
+A row has means, extremes and sums of the publications of a minute. A thread writes four rows in one transaction, and an event
+at once or ``WRITE_S`` after the previous transaction. ``kill -9`` loses the open minute and unwritten rows and events.
 """
 
 import asyncio
@@ -137,12 +137,12 @@ WRITE_S = 60.0
 """Minimum interval between two writes [s], so that a flapping alarm does not wear the disk. Each write is synced to
 disk, because ``WRITE_S`` is longer than the interval between the database's fsyncs."""
 WRITTEN_ROWS = 4
-"""Number of rows in a transaction, because each transaction writes about nine disk blocks, whatever its number of rows."""
+"""Number of rows in a transaction. A transaction writes about nine disk blocks, whatever its number of rows."""
 MINUTES_A_DAY = 1440
 """Number of minutes in a day."""
-WAITING_MINUTES = 2 * MINUTES_A_DAY
+MAX_WAITING_ROWS = 2 * MINUTES_A_DAY
 """Maximum number of rows in memory while the disk cannot be written."""
-WAITING_EVENTS = 1000
+MAX_WAITING_EVENTS = 1000
 """Maximum number of events in memory while the disk cannot be written."""
 MAX_EVENTS = 50_000
 """Maximum number of events in the database, so that a flapping line does not fill the disk."""
@@ -189,8 +189,8 @@ class HistorySink:
         self._last_interval_s = 0.0  # between the last two estimates
         self._open: MinuteAccumulator | None = None
         # waiting rows and events with their numbers
-        self._minutes: deque[tuple[int, Minute]] = deque(maxlen=WAITING_MINUTES)
-        self._events: deque[tuple[int, Event]] = deque(maxlen=WAITING_EVENTS)
+        self._minutes: deque[tuple[int, Minute]] = deque(maxlen=MAX_WAITING_ROWS)
+        self._events: deque[tuple[int, Event]] = deque(maxlen=MAX_WAITING_EVENTS)
         self._run_id, self._last_number = secrets.token_hex(8), 0
         self._due = asyncio.Event()
         self._closing = asyncio.Event()
@@ -320,5 +320,5 @@ def _prune(connection: sqlite3.Connection, max_rows: int) -> None:
     if oldest is not None:
         connection.execute("DELETE FROM minute WHERE time_s < ?", oldest)
         connection.execute("DELETE FROM event WHERE time_s < ?", oldest)
-    newest_excess = "SELECT number FROM event ORDER BY number DESC LIMIT 1 OFFSET ?"
-    connection.execute(f"DELETE FROM event WHERE number <= ({newest_excess})", (MAX_EVENTS,))  # noqa: S608
+    newest_to_delete = "SELECT number FROM event ORDER BY number DESC LIMIT 1 OFFSET ?"
+    connection.execute(f"DELETE FROM event WHERE number <= ({newest_to_delete})", (MAX_EVENTS,))  # noqa: S608

@@ -125,7 +125,7 @@ __all__ = ["Outbox", "QueuedMessage"]
 
 
 class Outbox:
-    """Stores messages in order until the broker acknowledges them.
+    """Store of messages, in order, until the broker acknowledges them.
 
     Args:
         database: Database for messages during an outage; None: memory only.
@@ -179,12 +179,12 @@ class Outbox:
         self._queue.put(message, on_result)
         self._wake_taker()
 
-    async def take(self, most: int) -> list[QueuedMessage]:
-        """Wait for a message, then return up to ``most`` of the oldest messages not yet returned since ``rewind``."""
+    async def take(self, max_count: int) -> list[QueuedMessage]:
+        """Wait for a message, then return up to ``max_count`` of the oldest messages not yet returned since ``rewind``."""
         while not (self._backlog_read and self._queue.can_take):
             self._message_ready.clear()
             await self._message_ready.wait()
-        taken = self._queue.take_next(most)
+        taken = self._queue.take_next(max_count)
         if self._queue.needs_page:
             self._sync_requested.set()
         return taken

@@ -79,8 +79,8 @@ class NumberRanges:
 
 
 MAX_TAIL = 4096
-"""Maximum number of messages in the tail, which grows while the disk cannot be written. The limit corresponds to some
-megabytes, or to the states of an hour at one a second."""
+"""Maximum number of messages in the tail, which grows while the disk cannot be written. The states of an hour, one each
+second, take some megabytes."""
 PAGE = 1000
 """Maximum number of ready messages. The next page is read from disk once fewer than half of them are left."""
 
@@ -150,10 +150,10 @@ class OutboxQueue:
         if len(self._tail) > MAX_TAIL:
             self._drop_oldest(only_tail=True)
 
-    def take_next(self, most: int) -> list[QueuedMessage]:
-        """Return up to ``most`` of the oldest messages in memory, which are then in flight."""
+    def take_next(self, max_count: int) -> list[QueuedMessage]:
+        """Return up to ``max_count`` of the oldest messages in memory, which are then in flight."""
         taken: list[QueuedMessage] = []
-        while len(taken) < most and self.can_take:
+        while len(taken) < max_count and self.can_take:
             taken.append((self._ready or self._tail).popleft())
         self.in_flight |= {queued.number: queued for queued in taken}
         return taken
@@ -229,10 +229,10 @@ class OutboxQueue:
         """Return ranges of numbers that are no longer queued, as half-open intervals."""
         in_memory = [range(queued.number, queued.number + 1) for queued in self._in_memory()]
         gaps, begin = [], MIN_NUMBER
-        for queued in sorted([*in_memory, *self.stored], key=lambda each: each.start):
-            if begin < queued.start:
-                gaps.append((begin, queued.start))
-            begin = queued.stop
+        for numbers in sorted([*in_memory, *self.stored], key=lambda each: each.start):
+            if begin < numbers.start:
+                gaps.append((begin, numbers.start))
+            begin = numbers.stop
         return [*gaps, (begin, self.next_number)] if begin < self.next_number else gaps
 
     def _in_memory(self) -> Iterator[QueuedMessage]:

@@ -39,7 +39,8 @@ class CellAlarmInput(NamedTuple):
     texts: tuple[str, ...] = ()
     """Description of each faulty cell, one sentence each."""
     kinds: tuple[tuple[int, ReadingFault], ...] = ()
-    """Index and fault of each faulty cell. They show whether the faults have changed; ``texts`` also change with the measured values."""
+    """Index and fault of each faulty cell. They show whether the faults have changed; ``texts`` also change with the measured
+    values."""
 
 
 NO_FAULTY_CELL = CellAlarmInput(0.0)
@@ -53,7 +54,7 @@ class CellAlarmInputs(NamedTuple):
     short: CellAlarmInput
     """Largest lower bound of a cell's self-discharge current [A]; 0 if no self-discharge is significant."""
     reading: CellAlarmInput
-    """Error of a reading [V]."""
+    """Largest error of a cell's reading [V]."""
 
 
 def cell_alarm_inputs(cells: CellDeviations) -> CellAlarmInputs:

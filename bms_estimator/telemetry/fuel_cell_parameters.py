@@ -26,7 +26,7 @@ def fuel_cell_parameters(estimator: Estimator, now_s: float) -> dict[str, Parame
         if j == ACTIVATION:
             parameters["exchange_current_a"] = _exchange_current(a, covariance, now_s)
         else:
-            parameters[name] = _learned(float(a[1 + j]), float(std[j]), now_s)
+            parameters[name] = _learned_parameter(float(a[1 + j]), float(std[j]), now_s)
     return parameters
 
 
@@ -36,12 +36,12 @@ def ln_covariance(estimator: Estimator) -> np.ndarray:
     The covariance is the inverse of the information of past data [V^2 s] plus a prior. In the prior the bounds of each
     parameter count as one standard deviation. Errors of the model itself are not included.
     """
-    m, q = estimator.record[0]["learning"], estimator.settings_record[0]["learning"]
-    n = int(q["count"])
-    lower, leak = np.tril(m["information"][:n, :n]), q["leak_v2s"][:n]
+    settings = estimator.settings_record[0]["learning"]
+    n = int(settings["count"])
+    lower, leak = np.tril(estimator.record[0]["learning"]["information"][:n, :n]), settings["leak_v2s"][:n]
     information = lower + np.tril(lower, -1).T + np.diag(leak)
     # the leakage is inversely proportional to the squared bounds; this factor makes its std without data equal to the bounds
-    return float(leak[0] * q["upper"][0] ** 2) * np.linalg.inv(information)
+    return float(leak[0] * settings["upper"][0] ** 2) * np.linalg.inv(information)
 
 
 def _exchange_current(a: np.ndarray, covariance: np.ndarray, now_s: float) -> Parameter:
@@ -52,10 +52,10 @@ def _exchange_current(a: np.ndarray, covariance: np.ndarray, now_s: float) -> Pa
     ln_i_0 = -float(a[1 + ACTIVATION] / a[1 + TAFEL])
     gradient = np.zeros(covariance.shape[0])
     gradient[ACTIVATION], gradient[TAFEL] = ln_i_0, -ln_i_0
-    return _learned(math.exp(ln_i_0), math.sqrt(gradient @ covariance @ gradient), now_s)
+    return _learned_parameter(math.exp(ln_i_0), math.sqrt(gradient @ covariance @ gradient), now_s)
 
 
-def _learned(value: float, ln_std: float, now_s: float) -> Parameter:
+def _learned_parameter(value: float, ln_std: float, now_s: float) -> Parameter:
     """Return the payload of a learned value; ``ln_std`` is the std of its logarithm."""
     valid = ln_std < VALID_STD
     return Parameter(

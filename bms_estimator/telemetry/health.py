@@ -68,7 +68,7 @@ def pack_model_health(model: SlowFit, times: FitTimes) -> PackModelHealth:
 
 
 def last_change(model: SlowFit) -> FitReport | None:
-    """Return the last change of SOC and capacity by a fit; None: none since start."""
+    """Return the last change of SOC and capacity by a fit; None: no change since start."""
     change, declared_ah = model.last_change, float(model.estimator.settings["capacity_as"][0]) / 3600.0
     if change is None:
         return None
@@ -89,7 +89,7 @@ _SAMPLE_COUNTERS = [
 ]
 """Fields of OBSERVER_STATE that count samples."""
 MAX_SERIES_FACTOR = 200
-"""Maximum number of cells in series that is suggested, relative to the configured one. It is that of a vehicle of 800 V."""
+"""Maximum suggested number of cells in series, relative to the configured number. An 800 V vehicle has as many cells."""
 
 
 def resident_mib() -> float | None:
@@ -122,7 +122,7 @@ def identifier_counters(record: np.void) -> dict[str, int]:
 
 
 def last_anchor(record: np.void) -> AnchorReport | None:
-    """Return the last end of a charge or discharge, from a record of ESTIMATOR_STATE; None without one."""
+    """Return the last end of a charge or discharge, from a record of ESTIMATOR_STATE; None before the first end."""
     a = record["anchors"]
     if a["last"] == NO_ANCHOR:
         return None
@@ -154,7 +154,7 @@ def suspicions(record: np.void, settings: np.void) -> list[str]:
 def make_health_payload(
     record: np.void,
     settings: np.void,
-    line: Mapping[str, int],
+    source_counters: Mapping[str, int],
     *,
     now_s: float,
     uptime_s: float,
@@ -177,7 +177,7 @@ def make_health_payload(
     Args:
         record: Record of dtype ESTIMATOR_STATE.
         settings: Record of dtype ESTIMATOR_SETTINGS.
-        line: Counters of the source.
+        source_counters: Counters of the source.
         now_s: Wall clock [s since 1970].
         uptime_s: Time since the service started [s].
         loop_lag_s: Longest delay of the event loop since the last report [s].
@@ -190,9 +190,9 @@ def make_health_payload(
         unseen_s: Length of the last gap without samples [s]; None if there was none or it is unknown.
         loop: Delays of the event loop.
         recording: State of the recording; None: nothing is recorded.
-        edge: State of the fleet edge; None without one.
+        edge: State of the fleet edge; None without an edge.
         hooks: Successes and failures of alarm hooks; None without hooks.
-        pack_model: State of the slow fit; None without one.
+        pack_model: State of the slow fit; None without a slow fit.
     """
     state = record["observer"]
     return Health(
@@ -201,11 +201,11 @@ def make_health_payload(
         loop_lag_s=loop_lag_s,
         rss_mib=resident_mib(),
         restarts=restarts,
-        reconnects=line.get("reconnects", 0),
+        reconnects=source_counters.get("reconnects", 0),
         sensor_online=sensor_message is None,
         sensor_message=sensor_message,
         clock_ppm=clock_ppm,
-        line={name: int(count) for name, count in line.items() if name != "reconnects"},
+        line={name: int(count) for name, count in source_counters.items() if name != "reconnects"},
         samples=sample_counters(state),
         identifier=identifier_counters(record),
         suspects=suspicions(record, settings),
@@ -232,7 +232,7 @@ def make_health_payload(
 
 
 def out_of_range_reason(block: SampleBlock, settings: np.void) -> str | None:
-    """Describe the last sample of a block that is out of range or not a number; None without one.
+    """Describe the last sample of a block that is out of range or not a number; None without such a sample.
 
     Args:
         block: Samples, of which some were dropped.

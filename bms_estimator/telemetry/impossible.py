@@ -15,8 +15,8 @@ FACTORS = 10, 100, 1000
 FACTOR_TOLERANCE = 0.1
 """Tolerance of a ratio that shows one of the factors."""
 MIN_SWAPPED = 1e7
-"""Absolute value from which a number is assumed to have swapped words. As a float or an integer of two registers, these differ
-from the true number by a factor of 65,536 and more."""
+"""Absolute value from which the two words of a number are assumed to be swapped. A swap of the registers of a float or an
+integer changes the number by a factor of 65,536 or more."""
 STEPS = 1.0, 0.1, 0.01, 0.001
 """Usual resolutions of integers in protocols."""
 WORD_BITS = 16, 32
@@ -46,7 +46,7 @@ class PackBounds(NamedTuple):
         Args:
             quantity: Quantity whose value is impossible (``kernels.alarms.values.possible_values``).
             sample: The sample, dtype SAMPLE.
-            cells_v: Its cell voltages [V]; empty without any.
+            cells_v: Its cell voltages [V]; empty if there are none.
         """
         if quantity == "current":
             return self._describe_current(float(sample["current_a"]))
@@ -62,12 +62,12 @@ class PackBounds(NamedTuple):
     def _describe_current(self, ampere: float) -> tuple[str, str]:
         """Return the likely cause of an impossible current [A], and a sentence with it."""
         text = f"the current cannot be true: {ampere:.6g} A"
-        if abs(ampere) <= self.max_a:  # possible, but not beside a voltage in mV
-            kind = _factor_question(MILLI)
-            return kind, f"{text} with this voltage ({kind})"
-        kind = _current_cause(ampere, self.range_a)
+        if abs(ampere) <= self.max_a:  # possible, but the sample's voltage is in mV
+            cause = _factor_question(MILLI)
+            return cause, f"{text} with this voltage ({cause})"
+        cause = _current_cause(ampere, self.range_a)
         text += f", and at most {self.max_a:.6g} A are possible"
-        return kind, f"{text} ({kind})"
+        return cause, f"{text} ({cause})"
 
     def _describe_voltage(self, volt: float, sum_v: float) -> tuple[str, str]:
         """Return the likely cause of an impossible voltage, and a sentence with it.
@@ -78,21 +78,21 @@ class PackBounds(NamedTuple):
         """
         text = f"the pack's voltage cannot be true: {volt:.6g} V"
         if math.isfinite(sum_v):
-            kind = _factor_question(volt / sum_v) or (
+            cause = _factor_question(volt / sum_v) or (
                 "is the output switched off, or is another voltage measured?"
                 if volt >= 0.0
                 else "are the wires reversed?"
             )
-            return kind, f"{text}, and the sum of the cells is {sum_v:.6g} V ({kind})"
+            return cause, f"{text}, and the sum of the cells is {sum_v:.6g} V ({cause})"
         low_v, high_v = self.range_v
         fitting = next((factor for factor in FACTORS if low_v <= volt / factor <= high_v), None)
         if fitting:
-            kind = _factor_question(fitting)
+            cause = _factor_question(fitting)
         elif abs(volt) >= MIN_SWAPPED:
-            kind = "are the words of a 32-bit number swapped?"
+            cause = "are the words of a 32-bit number swapped?"
         else:
-            kind = "are the wires reversed?" if volt < 0.0 else "is pack.series right?"
-        return kind, f"{text} of {self.series} cells in series ({kind})"
+            cause = "are the wires reversed?" if volt < 0.0 else "is pack.series right?"
+        return cause, f"{text} of {self.series} cells in series ({cause})"
 
 
 def _describe_cells(sum_v: float, pack_v: float) -> tuple[str, str]:
@@ -102,9 +102,9 @@ def _describe_cells(sum_v: float, pack_v: float) -> tuple[str, str]:
         sum_v: Sum of the cell voltages [V].
         pack_v: Voltage of the pack [V].
     """
-    kind = _factor_question(sum_v / pack_v) or "are the wires of the cells connected?"
+    cause = _factor_question(sum_v / pack_v) or "are the wires of the cells connected?"
     text = f"the cell voltages cannot be true: their sum is {sum_v:.6g} V, and the pack has {pack_v:.6g} V"
-    return kind, f"{text} ({kind})"
+    return cause, f"{text} ({cause})"
 
 
 def _current_cause(ampere: float, range_a: float) -> str:
@@ -131,7 +131,7 @@ def _current_cause(ampere: float, range_a: float) -> str:
 def _factor_question(ratio: float) -> str:
     """Return the question for a value that is wrong by one of ``FACTORS``; empty for another ratio to the true value."""
     for factor in FACTORS:
-        for fault in (factor, 1 / factor):
-            if abs(ratio / fault - 1.0) <= FACTOR_TOLERANCE:
+        for error in (factor, 1 / factor):
+            if abs(ratio / error - 1.0) <= FACTOR_TOLERANCE:
                 return f"is the unit or scale wrong by a factor of {factor}?"
     return ""

@@ -33,7 +33,7 @@ class ChargeEnergy(NamedTuple):
         return cls(*(getattr(total, name) for name in cls._fields))
 
     def plus_net(self, charge_as: float, energy_ws: float) -> "ChargeEnergy":
-        """Return the sum with net ``charge_as`` [A s] and ``energy_ws`` [W s], positive on discharge, each added to its direction."""
+        """Return the sum with net ``charge_as`` [A s] and ``energy_ws`` [W s], positive on discharge, by direction."""
         charge_ah, energy_kwh = charge_as / 3600.0, energy_ws / 3.6e6
         return ChargeEnergy(
             self.charge_out_ah + max(charge_ah, 0.0),
@@ -48,7 +48,7 @@ class ChargeEnergy(NamedTuple):
 
 
 class ChargeEnergyMeter:
-    """Integrates current and power by the trapezoidal rule, and adds nothing over a gap.
+    """Integrator of current and power by the trapezoidal rule. Gaps add nothing.
 
     Between two calls of ``update_totals`` the integral is net, so that current noise around zero does not count in both
     directions.
@@ -111,10 +111,10 @@ class LifetimeTotals:
         samples = Counter(self._before.samples)
         samples.update(sample_counters(self._estimator.state[0]))
         changed = {"samples": dict(samples), "unseen_s": self._before.unseen_s + self._gaps_s}
-        return self._before.model_copy(update=changed | self.flow._asdict())
+        return self._before.model_copy(update=changed | self.charge_energy._asdict())
 
     @property
-    def flow(self) -> ChargeEnergy:
+    def charge_energy(self) -> ChargeEnergy:
         """Charge and energy through the terminals in all runs."""
         return self._meter.update_totals()
 

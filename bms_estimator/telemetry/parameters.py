@@ -34,7 +34,7 @@ from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.series_resistance import series_resistance_parameters, settling_reason
 from bms_estimator.telemetry.state import finite
 
-POINTS = 101
+FIT_POINTS = 101
 """Number of evenly spaced SOCs at which (2.10) is fitted."""
 
 
@@ -62,8 +62,8 @@ def _fit_table(ocv: TableOcv) -> OcvFormulaFit:
     from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora  # noqa: PLC0415
     from bms_estimator.calibration.ocv.points import Points, rms_v  # noqa: PLC0415
 
-    soc = np.linspace(0.0, 1.0, POINTS)
-    fit = fit_chen_mora(Points(soc, MonotoneCubic(ocv.soc, ocv.ocv_v)(soc), np.ones(POINTS)))
+    soc = np.linspace(0.0, 1.0, FIT_POINTS)
+    fit = fit_chen_mora(Points(soc, MonotoneCubic(ocv.soc, ocv.ocv_v)(soc), np.ones(FIT_POINTS)))
     return OcvFormulaFit(tuple(map(float, fit.a)), tuple(map(float, fit.std)), rms_v(fit.residual_v))
 
 
@@ -74,7 +74,8 @@ CONFIGURED_REASON = "from the cell file: no data has identified it"
 MOVED_REASON = "moved by the adaptive law of the thesis, which does not identify it"
 """Reason why a value that a law of the thesis has changed is not valid."""
 MOVED_RATIO = 1e-6
-"""Relative change above which a law of the thesis has changed a value of the cell file. Near the limit of (3.18), e^2 changes it less."""
+"""Relative change above which a law of the thesis has changed a value of the cell file. Near its limit, (3.18) changes it
+less."""
 LEARNED_REASON = "learned by the adaptive law, which gives no std"
 """Reason why a value of the learning law is not valid."""
 CAPACITANCE_PARAMETERS = range(7, 13)
@@ -145,7 +146,7 @@ def _battery_report(estimator: Estimator, cell: CellModel, now_s: float) -> Para
         elements[name] = _mark_source(_with_reason(elements[name], reason), from_data[own].any(), learning)
     if estimator.identifying:
         for name, identified in present_elements(record).items():
-            elements[name] = _identified(identified, elements[name], VALID_STD, now_s)
+            elements[name] = _select_parameter(identified, elements[name], VALID_STD, now_s)
         health = _state_of_health(estimator, now_s)
     if estimator.settings_record["series_resistance"][0]:
         fitted = series_resistance_parameters(estimator)
@@ -169,7 +170,7 @@ def _fuel_cell_report(estimator: Estimator, now_s: float) -> ParameterReport:
 
 def _cell_file_parameters(cell: CellModel, a: np.ndarray) -> dict[str, Parameter]:
     """Return a1..a21 as configured values; a16..a21 are fitted if the cell file has an OCV table."""
-    parameters = {f"a{i}": _configured(a[i], "") for i in range(1, 22)}
+    parameters = {f"a{i}": _configured_parameter(a[i], "") for i in range(1, 22)}
     fit = fit_ocv_formula(cell)
     if fit is None:
         return parameters
@@ -211,8 +212,8 @@ def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
     for name, function in _ELEMENT_FUNCTIONS.items():
         value, limit = function(soc, a), limits.get(name, "")
         why_missing = f"SOC {soc:.4f} is not above {limit} = {state[limit]:.4f}" if limit else ""
-        elements[name] = _configured(value if value > 0.0 else math.nan, why_missing)
-    elements["e_o_v"] = _configured(chen_mora.ocv(soc, ocv["ocv_v"], ocv["ocv_slope_v"]), "")
+        elements[name] = _configured_parameter(value if value > 0.0 else math.nan, why_missing)
+    elements["e_o_v"] = _configured_parameter(chen_mora.ocv(soc, ocv["ocv_v"], ocv["ocv_slope_v"]), "")
     return elements
 
 
@@ -224,7 +225,7 @@ def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]
     first_std_a = float(p["offset_c"] * p["capacity_as"]) / 3600.0
     return {
         "capacity": _bias_parameter(capacity, VALID_CAPACITY_STD, "identifier.capacity_std", now_s),
-        "r_s": _identified(ratio, _configured(1.0, ""), VALID_STD, now_s),
+        "r_s": _select_parameter(ratio, _configured_parameter(1.0, ""), VALID_STD, now_s),
         "current_offset_a": _bias_parameter(
             offset_a, VALID_OFFSET_FRACTION * first_std_a, "identifier.current_offset_std_a", now_s
         ),
@@ -285,7 +286,7 @@ def _with_fit_std(observer_value: Parameter, fit: IdentifiedValue | None, now_s:
     value = observer_value.value
     if value is not None:  # the observer's value differs from the fit if a bound limits the fit
         fit = fit._replace(value=value, std=math.hypot(fit.std, fit.value - value))
-    return _identified(fit, observer_value, VALID_FIT_STD, now_s)
+    return _select_parameter(fit, observer_value, VALID_FIT_STD, now_s)
 
 
 def _with_tau_validity(parameter: Parameter, estimator: Estimator) -> Parameter:
@@ -301,7 +302,7 @@ def _with_tau_validity(parameter: Parameter, estimator: Estimator) -> Parameter:
     return parameter.model_copy(update={"valid": False, "reason": reason})
 
 
-def _identified(learned: IdentifiedValue, observer_value: Parameter, limit: float, now_s: float) -> Parameter:
+def _select_parameter(learned: IdentifiedValue, observer_value: Parameter, limit: float, now_s: float) -> Parameter:
     """Return the learned value if its relative std is below ``limit``.
 
     Otherwise return the observer's value, with the progress of learning as its reason.
@@ -321,7 +322,7 @@ def _identified(learned: IdentifiedValue, observer_value: Parameter, limit: floa
     return observer_value.model_copy(update={"std": finite(std), "reason": reason})
 
 
-def _configured(value: float, why_missing: str) -> Parameter:
+def _configured_parameter(value: float, why_missing: str) -> Parameter:
     """Return a configured value; ``why_missing`` is the reason if it is not finite."""
     number = finite(value)
     return Parameter(

@@ -1,4 +1,4 @@
-"""Publish window: sums over the samples since the last publication; and the detection of rest from its means.
+"""Sums over the samples since the last publication, and detection of rest from the means of these publish windows.
 
 Rest is a condition for the calibration of the current sensor's zero.
 """
@@ -24,7 +24,7 @@ MAX_VOLTAGE_STEPS = 2.0
 
 
 class RestDetector:
-    """Detects rest from the means of the publish windows.
+    """Detector of rest from the means of the publish windows.
 
     Args:
         current_max_a: Maximum current of the pack [A].
@@ -136,7 +136,7 @@ class Window:
             self._probes = probes[-1:]
         if trace.size:
             self.soc_known = accumulate_window(self._sums, trace, self.soc_known)
-            # numpy copies a record field by field, which takes longer than the sums
+            # a copy of the record would copy field by field, which takes longer than the sums
             self._last = np.frombuffer(trace[-1:].tobytes(), trace.dtype)[0]
         self._arrival_s = arrival_s
 
@@ -144,7 +144,7 @@ class Window:
         """Return the summary of the samples since the last call, and begin a new window. Return None without a sample."""
         if self._last is None:
             return None
-        n, first_s, voltage, current, power, temperatures, temperature = self._sums[0].item()
+        n, first_s, voltage, current, power, temperature_count, temperature = self._sums[0].item()
         last_s = float(self._last["time_s"])
         # the window begins at the last sample of the previous window, or at its own first sample
         steps, begin_s = (n, self.previous_end_s) if math.isfinite(self.previous_end_s) else (n - 1, first_s)
@@ -155,7 +155,7 @@ class Window:
             voltage_v=voltage / n,
             current_a=current / n,
             power_w=power / n,
-            temperature_c=temperature / temperatures if temperatures else math.nan,
+            temperature_c=temperature / temperature_count if temperature_count else math.nan,
             sample_rate_hz=steps / span_s if span_s > 0.0 else math.nan,
             last=self._last,
             soc_known=self.soc_known,

@@ -59,11 +59,11 @@ def clock_duration(duration_s: float) -> str:
 
 
 UNKNOWN_SOC = "the SOC is not known yet: charge the pack to full once, or let it rest for ten minutes"
-"""Reason without a known SOC, and what helps."""
+"""Reason for a missing value that needs a known SOC, with the remedy."""
 ALWAYS_STABLE = "the thesis's model is valid at each SOC: delta_1 and delta_2 are not above 0"
-"""Reason with capacitances that are positive at each SOC."""
+"""Reason for a missing margin while the capacitances are positive at each SOC."""
 NOT_IDENTIFIED = "delta_1 and delta_2 follow from a7..a12, which are not valid: see the topic parameters"
-"""Reason without a valid shape of the capacitances over SOC."""
+"""Reason for a missing margin while the capacitances over SOC are not known."""
 
 
 def known_margin(trace: Any, soc_known: Any) -> Any:
@@ -152,12 +152,13 @@ NO_CELL_FIELDS: Mapping[str, Any] = MappingProxyType(
         None,
     )
 )
-"""Fields of ``Estimate`` about estimates of single cells, without any."""
+"""Fields of ``Estimate`` about single cells while there is no estimate of them."""
 COMPUTED = {
     *("voltage_estimate_v", "voltage_v", "current_a", "temperature_c", "stability_margin", "stability_margin_std"),
     *("delta_configured", "converged", "lock"),
 }
-"""Columns of the trace whose field of ``Estimate`` is computed: means, a margin that needs a known SOC, and booleans from integers."""
+"""Columns of the trace whose field of ``Estimate`` is computed: means, a margin that needs a known SOC, and booleans from
+integers."""
 COPIED = tuple(name for name in TRACE.names or () if name in Estimate.model_fields and name not in COMPUTED)
 """Columns of the trace whose last value is copied to the field of ``Estimate`` with an equal name."""
 
@@ -247,7 +248,7 @@ def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _probes(probes: ProbeBlock) -> dict[str, Any]:
-    """Return the fields about temperature probes; None without several."""
+    """Return the fields about temperature probes; None with fewer than two probes."""
     if probes.size < 2:
         return {"temperatures_c": None, "faulty_probes": None}
     return {

@@ -1,7 +1,7 @@
-"""Weakest cell of a pack: by the cell voltages, or without them by the voltage of the bank; and the remaining charge."""
+"""Remaining charge of a pack, and its weakest cell, found by the cell voltages or else by the voltage of the bank."""
 
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
@@ -23,7 +23,7 @@ def remaining_capacity_ah(estimator: Estimator) -> float:
 
 
 def full_capacity_ah(estimator: Estimator) -> float:
-    """Return the learned capacity [Ah], after a sample; without the identifier the declared one."""
+    """Return the capacity [Ah] that the identifier has learned, after a sample; without an identifier, the declared capacity."""
     ratio = relative_capacity(estimator.record[0]).value if estimator.identifying else 1.0
     return ratio * float(estimator.settings["capacity_as"][0]) / 3600.0
 
@@ -31,15 +31,12 @@ def full_capacity_ah(estimator: Estimator) -> float:
 class WeakestCell(NamedTuple):
     """Estimate of the weakest cell."""
 
-    number: int | None
-    """Number of the cell, from 1; None: unknown, because only the voltage of the bank is measured."""
     soc: float
     """SOC, 0..1."""
     std: float
     """Std of ``soc``."""
     capacity_ratio: float
     """Capacity relative to the other cells."""
-    by: Literal["cell voltages", "bank voltage"]
 
 
 def weakest_cell(pack: Pack) -> WeakestCell | None:
@@ -47,14 +44,12 @@ def weakest_cell(pack: Pack) -> WeakestCell | None:
     estimator, cells = pack.estimator, pack.cells.deviations if pack.cells else None
     if cells is not None:
         i = cells.weakest
-        return WeakestCell(i + 1, cells.soc[i], cells.soc_std[i], cells.capacity_ratio[i], "cell voltages")
+        return WeakestCell(cells.soc[i], cells.soc_std[i], cells.capacity_ratio[i])
     weakest = pack.slow_fit.bank.weakest if pack.slow_fit and pack.slow_fit.bank else None
     if weakest is None or math.isnan(estimator.soc):
         return None
     soc, std = weakest.weakest_soc(estimator.soc)
-    return WeakestCell(
-        None, soc, math.hypot(std, estimator.record[0]["filter"]["soc_std"]), weakest.capacity_ratio, "bank voltage"
-    )
+    return WeakestCell(soc, math.hypot(std, estimator.record[0]["filter"]["soc_std"]), weakest.capacity_ratio)
 
 
 def estimate_fields(pack: Pack) -> dict[str, Any]:

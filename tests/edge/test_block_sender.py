@@ -56,7 +56,7 @@ class SimulatedEdge:
             steady=lambda: self.now_s,
             first_delay_s=0.05,
             retry_s=0.05,
-            handover_s=LONG_S,
+            final_send_timeout_s=LONG_S,
         )
 
     def add(self, minutes: float, cells_v: CellBlock = NO_CELLS) -> None:
@@ -223,7 +223,7 @@ async def test_invalid_block_requests_are_counted_and_ignored(
 
 async def test_blocks_are_sent_to_any_mqtt_broker(broker: Broker, tmp_path: Path) -> None:
     """A receiver at an MQTT broker without NATS confirms blocks and requests resends."""
-    edge = BlockSender(EdgeSettings(url=broker.url), "pack", tmp_path, handover_s=LONG_S)
+    edge = BlockSender(EdgeSettings(url=broker.url), "pack", tmp_path, final_send_timeout_s=LONG_S)
     async with Listener(broker, "raw/#") as listener, edge:
         samples = np.zeros(600, dtype=SAMPLE)
         samples["time_s"] = np.arange(600.0)

@@ -125,9 +125,9 @@ def test_the_wait_for_the_first_sample_extends_the_gap_of_record_history_and_cel
     assert all(outcome.startswith("restored") for outcome in outcomes.values())
     assert pack.cells
     record, bank = pack.estimator.record, pack.cells.bank
-    pack.waited(2.0)
-    pack.waited(3.0)
+    pack.extend_gap(2.0)
+    pack.extend_gap(3.0)
     assert record["unseen_s"][0] == record["history"]["gap_s"][0] == bank["unseen_s"][0] == 15.0
     pack.run(recording[0][:1], recording[1][:1])
-    pack.waited(4.0)
+    pack.extend_gap(4.0)
     assert record["history"]["gap_s"][0] == 15.0

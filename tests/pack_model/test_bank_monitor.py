@@ -14,7 +14,7 @@ from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import SOC, PackFit
 from bms_estimator.pack_model.history import History, ReferenceDischarges, WeakCellTime
 from bms_estimator.pack_model.open_circuit import fitted_ocv
-from bms_estimator.pack_model.saved import history_arrays, history_of, neutral_fit
+from bms_estimator.pack_model.saved import history_arrays, history_from_arrays, neutral_fit
 from bms_estimator.settings.alarm_limits import WEAK_CELL_STD
 
 
@@ -78,7 +78,7 @@ def monitored(history: History, fit: PackFit = FIT) -> BankMonitor:
 
 def test_a_cell_that_is_weak_in_all_rows_of_the_history_deviates_from_the_first_discharges() -> None:
     rows, healthy = discharges(range(10, 14), 0.9), ReferenceDischarges(discharges(range(5), 1.0), FIT)
-    deviation = [monitored(History(rows, first=first)).weakest.deviation_std for first in (None, healthy)]
+    deviation = [monitored(History(rows, first_discharges=first)).weakest.deviation_std for first in (None, healthy)]
     assert deviation[0] < 1.0
     assert deviation[1] > WEAK_CELL_STD
 
@@ -86,44 +86,46 @@ def test_a_cell_that_is_weak_in_all_rows_of_the_history_deviates_from_the_first_
 def test_first_discharges_do_not_change() -> None:
     history = History(discharges(range(6), 1.0))
     monitor = monitored(history)
-    first = history.first
+    first = history.first_discharges
     assert first is not None
     assert first.rows["elapsed_s"].max() < 1e5 * 5  # without the present discharge
     history.append(discharge(6, 1.0), CURVES.capacity_as)
     monitor.add(history, 1, FIT)
-    assert history.first is first
+    assert history.first_discharges is first
 
 
 def test_first_discharges_of_an_exchanged_pack_are_dropped_also_after_a_restart() -> None:
     history = History(discharges(range(6), 1.0))
     monitored(history)
-    assert history.first is not None
+    assert history.first_discharges is not None
     other = discharge(7, 1.0)
     other["segment"] = 1.0
     history.append(other, CURVES.capacity_as)
     monitored(history, replace(FIT, first_segment=1.0, is_exchanged=True))
-    assert history.first is None
+    assert history.first_discharges is None
 
 
 def test_times_of_weak_cells_survive_a_restart() -> None:
     times = [WeakCellTime(60.0, 120.0, 0.5), WeakCellTime(240.0, np.inf, 0.4)]
-    restored, _ = history_of(history_arrays(History(rows_of([0.0]), times), None))
+    restored, _ = history_from_arrays(history_arrays(History(rows_of([0.0]), times), None))
     assert restored.weak_cell_times == times
 
 
 def test_first_discharges_survive_a_restart() -> None:
     rows = rows_of([0.0, 1.0])
     fit = replace(neutral_fit(), hysteresis=0.5)
-    restored, _ = history_of(history_arrays(History(rows, first=ReferenceDischarges(rows[:1], fit)), None))
-    assert restored.first is not None
-    assert restored.first.rows.tobytes() == rows[:1].tobytes()
-    assert restored.first.fit.hysteresis == 0.5
+    restored, _ = history_from_arrays(
+        history_arrays(History(rows, first_discharges=ReferenceDischarges(rows[:1], fit)), None)
+    )
+    assert restored.first_discharges is not None
+    assert restored.first_discharges.rows.tobytes() == rows[:1].tobytes()
+    assert restored.first_discharges.fit.hysteresis == 0.5
 
 
 def test_damaged_times_of_weak_cells_are_rejected() -> None:
     arrays = history_arrays(History(rows_of([0.0])), None) | {"weak_cell_times": np.full((1, 3), np.nan)}
     with pytest.raises(ValueError, match="times of weak cells are damaged"):
-        history_of(arrays)
+        history_from_arrays(arrays)
 
 
 def test_soc_of_an_over_discharged_cell_is_zero() -> None:

@@ -12,7 +12,7 @@ from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.pack_model.handover import adopt_curves
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.saved import curve_arrays, fit_of_curves, history_arrays, history_of
+from bms_estimator.pack_model.saved import curve_arrays, fit_from_arrays, history_arrays, history_from_arrays
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from tests.pack_model.quick_fit import CURVE_V, LN_PAIRS, LN_SERIES, quick_fit
@@ -33,7 +33,7 @@ def some_rows() -> np.ndarray:
 def test_history_and_fit_are_the_same_after_saving() -> None:
     rows = some_rows()
     fit = quick_fit(None, rows)  # type: ignore[arg-type]
-    history, restored = history_of(history_arrays(History(rows), fit))
+    history, restored = history_from_arrays(history_arrays(History(rows), fit))
     assert history.rows.tobytes() == rows.tobytes()
     assert restored
     for field in fields(fit):
@@ -54,14 +54,14 @@ def test_damaged_arrays_are_rejected(change: dict[str, Any]) -> None:
     rows = some_rows()
     arrays = history_arrays(History(rows), quick_fit(None, rows))  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"damaged|layout|order"):
-        history_of(arrays | change)
+        history_from_arrays(arrays | change)
 
 
 def test_a_missing_field_of_the_curves_is_rejected() -> None:
     arrays = curve_arrays(quick_fit(None, some_rows()))  # type: ignore[arg-type]
     del arrays["ln_r"]
     with pytest.raises(ValueError, match="ln_r"):
-        fit_of_curves(arrays)
+        fit_from_arrays(arrays)
 
 
 def fitted_estimator(cell: CellModel = CELL) -> Estimator:

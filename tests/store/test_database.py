@@ -175,7 +175,7 @@ async def test_deleted_folder_is_recreated(tmp_path):
 
 async def test_hung_disk_does_not_block_callers_and_is_used_again_once_it_answers(path):
     may_return = threading.Event()
-    async with Database(path, hang_s=0.05, retry_s=0.0) as database:
+    async with Database(path, disk_timeout_s=0.05, retry_s=0.0) as database:
         with pytest.raises(StoreError, match="has not answered"):
             await database.call(lambda _: may_return.wait(LONG_S))
         with pytest.raises(StoreError, match="has not answered"):
@@ -193,7 +193,7 @@ async def test_shutdown_with_a_hung_disk_has_one_deadline_for_the_writes_of_all_
     monkeypatch.setattr(database_module, "SHUTDOWN_TIMEOUT_S", 0.05)
     may_return = threading.Event()
     async with asyncio.timeout(LONG_S):
-        async with Database(path, hang_s=10 * LONG_S) as database:
+        async with Database(path, disk_timeout_s=10 * LONG_S) as database:
             async with Outbox(database, max_messages=10) as outbox, HistorySink(database, days=1) as history:
                 hung = asyncio.create_task(database.call(lambda _: may_return.wait(2 * LONG_S)))
                 history.publish(CELL_SNAPSHOT)
@@ -226,7 +226,7 @@ import asyncio, pathlib, sys, threading
 from bms_estimator.store.database import Database, StoreError
 
 async def main():
-    async with Database(pathlib.Path(sys.argv[1]), hang_s=0.05) as database:
+    async with Database(pathlib.Path(sys.argv[1]), disk_timeout_s=0.05) as database:
         try:
             await database.call(lambda _: threading.Event().wait())
         except StoreError as error:

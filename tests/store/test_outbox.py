@@ -158,7 +158,10 @@ async def test_backlog_beyond_memory_is_read_from_disk_in_order(path):
 
 async def test_hung_disk_does_not_delay_messages_which_are_written_once_it_answers(path):
     may_return = threading.Event()
-    async with Database(path, hang_s=0.05, retry_s=0.0) as database, Outbox(database, max_messages=100) as outbox:
+    async with (
+        Database(path, disk_timeout_s=0.05, retry_s=0.0) as database,
+        Outbox(database, max_messages=100) as outbox,
+    ):
         await until(lambda: outbox._backlog_read)
         hung = asyncio.create_task(database.call(lambda _: may_return.wait(LONG_S)))
         for number in range(5):
@@ -172,7 +175,7 @@ async def test_hung_disk_does_not_delay_messages_which_are_written_once_it_answe
 
 async def test_start_with_a_hung_disk_sends_new_messages(path):
     may_return = threading.Event()
-    async with Database(path, hang_s=0.05, retry_s=0.0) as database:
+    async with Database(path, disk_timeout_s=0.05, retry_s=0.0) as database:
         hung = asyncio.create_task(database.call(lambda _: may_return.wait(LONG_S)))
         async with Outbox(database, max_messages=100) as outbox:
             outbox.put(numbered_message(0))

@@ -50,8 +50,8 @@ def unproven_starts(captures: Sequence[RecognizedCapture], given: CellModel) -> 
     lines = []
     has_other_curve = any(each.gives_ocv and each.start.is_exact for each in captures)
     for each in captures:
-        ends_full = each.gives_ocv and all(branch.charge for branch in each.slow_branches) and each.slow_branches
-        if each.start.is_exact or not each.is_ocv_test or ends_full or (has_other_curve and each.gives_ocv):
+        only_charges = each.gives_ocv and all(branch.charge for branch in each.slow_branches) and each.slow_branches
+        if each.start.is_exact or not each.is_ocv_test or only_charges or (has_other_curve and each.gives_ocv):
             continue
         remedy = (
             "the SOC is counted from there"
@@ -85,8 +85,8 @@ def capacity_warnings(
 ) -> list[str]:
     """Return a warning on a rated capacity that a capture contradicts.
 
-    Either a slow discharge measures much less, or the rated capacity is used, and the charge drawn from full may be the capacity
-    instead.
+    A slow discharge contradicts it by a much smaller capacity. If the rated capacity is used, the charge of another discharge
+    from full may be the true capacity.
 
     Args:
         given: Cell with the rated capacity.
@@ -115,9 +115,9 @@ def capacity_warnings(
 
 
 MAX_FULL_DEVIATION_V = 0.45
-"""Maximum difference between the highest voltages of captures of one cell [V]. It allows the 0.31 V between a full LFP cell at rest
-(3.34 V) and at the end of a charge (3.65 V), but not the difference between chemistries: full cells have 2.7 V (LTO), 3.6 V (LFP)
-or 4.2 V (with cobalt, nickel or manganese)."""
+"""Maximum difference between the highest voltages of captures of one cell [V]. It allows the 0.31 V between a full LFP cell at
+rest (3.34 V) and at the end of a charge (3.65 V), but not the difference between chemistries: full cells have 2.7 V (LTO), 3.6
+V (LFP) or 4.2 V (with cobalt, nickel or manganese)."""
 
 Report = Callable[[float, str], None]
 """Function that receives the finished fraction of the work, 0..1, and the name of the present step."""
@@ -135,8 +135,8 @@ class Calibration:
         model: Model fitted to all captures; if that fit finds no resistances, the model without the data held back.
         capacity: Capacity that SOC was counted against.
         captures: The captures, and what each determines.
-        is_ocv_measured: True if low-rate curves, rests of some minutes, or given curves determine the OCV; False if it is that of the
-            given cell, or an estimate from short rests.
+        is_ocv_measured: True if low-rate curves, rests of some minutes, or given curves determine the OCV; False if it is that
+            of the given cell, or an estimate from short rests.
         has_held_back_data: True if the data of the validation were held back from the fit.
         validation_data: Sentence that names the data of the validation.
         validations: Validation on the data that were held back; without such data, validations on all captures.
@@ -238,8 +238,9 @@ def _undetermined_starts(model: FittedModel, captures: Sequence[RecognizedCaptur
 def _require_equal_full_voltages(captures: Sequence[RecognizedCapture]) -> None:
     """Raise UserError if the highest voltages of captures show that the cells have different chemistries.
 
-    Captures that determine the OCV from full contain the full cell. Tests that draw more than their first voltage allows may do
-    so, too, if they are of another chemistry. The other captures do not exceed the voltage of the full cell.
+    Captures that determine the OCV from full contain the full cell. A test of another chemistry may
+    contain it, too, if it draws more than its first voltage allows. The other captures do not exceed the voltage of the full
+    cell.
     """
     ranges_v = {each.capture.name: np.percentile(each.good["voltage_v"], [1.0, 99.0]) for each in captures}
     from_full = [
@@ -271,8 +272,8 @@ def _require_usable_capture(captures: Sequence[RecognizedCapture], start_notes: 
 def _fit_both(
     fitter: ModelFitter, split: Split, all_data: Split, report: Report
 ) -> tuple[FittedModel, FittedModel, list[str]]:
-    """Return the model without the data held back, the model of all data, and a note if the first replaces the second."""
-    fits = 1 if split.held_back is None else 2  # they take almost the whole time
+    """Return the model without the data held back, the model of all data, and a note if the first is returned for both."""
+    fits = 1 if split.held_back is None else 2  # the fits take almost the whole time
 
     def fit(data: Split, step: str, finished_fits: int) -> FittedModel:
         report(finished_fits / fits, step)

@@ -67,8 +67,8 @@ def estimate_capacity(
         UserError: A capture has too few good samples, or the wrong sign of the current.
     """
     good = {capture.name: remove_glitches(capture.rows, capture.name) for capture in captures}
-    loads = [clean_capture(capture.name, capture.rows, rated) for capture in captures]
-    starts = starts_of(loads, rated, initial_soc)
+    cleaned = [clean_capture(capture.name, capture.rows, rated) for capture in captures]
+    starts = starts_of(cleaned, rated, initial_soc)
     branches = [
         branch
         for (name, samples), start in zip(good.items(), starts, strict=True)
@@ -95,7 +95,7 @@ def estimate_capacity(
 
 
 def _rated_or_rests(captures: Sequence[Columns], rated: CellModel) -> CapacityEstimate:
-    """Return the capacity by rests if it is exact enough, otherwise the rated capacity."""
+    """Return the capacity from rests if it is exact enough, otherwise the rated capacity."""
     rated_ah = rated.cell.capacity_ah
     try:
         rests = measure_capacity(captures, rated)

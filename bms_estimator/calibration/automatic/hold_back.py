@@ -20,15 +20,15 @@ class Split:
     """Split of captures into data for the fit and data for the validation.
 
     Attributes:
-        ocv: Captures that determine the open-circuit voltage.
-        resistances: Captures that determine the resistances.
+        ocv_captures: Captures that determine the open-circuit voltage.
+        resistance_captures: Captures that determine the resistances.
         held_back: Capture of the validation; None if no data are held back.
         held_back_from_s: Start of the data that are held back [s], counted from the first good sample of ``held_back``.
         sentence: Sentence that names the data that are held back.
     """
 
-    ocv: tuple[RecognizedCapture, ...]
-    resistances: tuple[RecognizedCapture, ...]
+    ocv_captures: tuple[RecognizedCapture, ...]
+    resistance_captures: tuple[RecognizedCapture, ...]
     held_back: RecognizedCapture | None = None
     held_back_from_s: float = 0.0
     sentence: str = "No data were held back: these are the errors on the data of the fit."
@@ -44,12 +44,12 @@ def use_all(captures: Sequence[RecognizedCapture]) -> Split:
     distances_k = np.abs(temperatures_c - REFERENCE_C)
     nearest_k = min((d for each, d in zip(captures, distances_k, strict=True) if each.gives_ocv), default=0.0)
     return Split(
-        ocv=tuple(
+        ocv_captures=tuple(
             each
             for each, distance_k in zip(captures, distances_k, strict=True)
             if each.gives_ocv and (each.slow_branches or distance_k < nearest_k + MIN_SPAN_K)
         ),
-        resistances=tuple(each for each in captures if each.gives_resistances),
+        resistance_captures=tuple(each for each in captures if each.gives_resistances),
     )
 
 
@@ -71,7 +71,7 @@ def hold_back(captures: Sequence[RecognizedCapture]) -> Split:
             others, held_back=chosen, sentence=f"Validated on {chosen.capture.name}, with a fit that did not use it."
         )
     all_data = use_all(captures)
-    return _hold_back_last_part(all_data) if all_data.resistances else all_data
+    return _hold_back_last_part(all_data) if all_data.resistance_captures else all_data
 
 
 def _others_suffice(chosen: RecognizedCapture, captures: Sequence[RecognizedCapture]) -> bool:
@@ -85,14 +85,14 @@ def _others_suffice(chosen: RecognizedCapture, captures: Sequence[RecognizedCapt
 
 def _hold_back_last_part(all_data: Split) -> Split:
     """Return the split that holds back the last part of the first capture with resistances."""
-    chosen, *others = all_data.resistances
+    chosen, *others = all_data.resistance_captures
     samples = chosen.good
     throughput_as = np.cumsum(np.append(np.abs(step_charges_as(samples["time_s"], samples["current_a"])), 0.0))
     end = int(np.argmax(throughput_as >= FIT_FRACTION * throughput_as[-1]))
     first_part = chosen.with_capture(Columns(samples[:end], f"first part of {chosen.capture.name}"))
     return replace(
         all_data,
-        resistances=(first_part, *others),
+        resistance_captures=(first_part, *others),
         held_back=chosen,
         held_back_from_s=float(samples["time_s"][end] - samples["time_s"][0]),
         sentence=(

@@ -47,7 +47,7 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class ModelFitter:
-    """Fitter of cell models. It has the inputs that are equal in the fit without the data held back and in the fit of all data.
+    """Fitter of cell models, with the inputs that the fit without the data held back shares with the fit of all data.
 
     Attributes:
         initial_cell: Given cell with the capacity. It supplies what the captures do not determine.
@@ -71,15 +71,17 @@ class ModelFitter:
         Raises:
             UserError: A capture cannot be used, or neither OCV nor resistances are determined.
         """
-        ocv = self._fit_ocv(data.ocv)
+        ocv = self._fit_ocv(data.ocv_captures)
         cell = self.initial_cell if ocv is None else ocv.cell
-        if ocv is not None and not self.capacity.from_slow_discharge:  # whose std the fit of the OCV sets
+        if ocv is not None and not self.capacity.from_slow_discharge:  # otherwise the OCV's fit has set its std
             cell = with_capacity(cell, cell.cell.capacity_ah, self.capacity.relative_std)
-        if not data.resistances:
+        if not data.resistance_captures:
             return FittedModel(cell, ocv, None, "no capture has a current above 0.1 C")
-        captures = [each.capture for each in data.resistances]
+        captures = [each.capture for each in data.resistance_captures]
         given_socs = {
-            each.capture.name: each.start.soc for each in data.resistances if each.start.origin is StartOrigin.GIVEN
+            each.capture.name: each.start.soc
+            for each in data.resistance_captures
+            if each.start.origin is StartOrigin.GIVEN
         }
         try:
             identification = identify(captures, cell, initial_socs=given_socs, progress=progress)

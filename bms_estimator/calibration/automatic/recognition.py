@@ -44,13 +44,13 @@ class RecognizedCapture:
         capture: The capture.
         good: Its samples without glitches, dtype ``SAMPLE``.
         kind: Kind of the test, such as "relaxation test, 19 rests".
-        slow_branches: Low-rate discharges and charges; empty without any.
+        slow_branches: Low-rate discharges and charges; empty if there are none.
         start: SOC at the first sample.
         reaches_full: True if the SOC is known and comes near 1, or was given, so that the capture determines the open-circuit
             voltage without others.
         is_ocv_test: True if the capture has low-rate curves or enough rests for an open-circuit voltage.
         gives_ocv: True if the capture determines the open-circuit voltage.
-        measures_ocv: True if it does so by low-rate curves, or by enough rests of some minutes.
+        measures_ocv: True if it does so with low-rate curves, or with enough rests of some minutes.
         gives_resistances: True if its current is large enough for resistances.
         temperature_c: Mean temperature [°C]; NaN without a sensor.
     """
@@ -69,7 +69,7 @@ class RecognizedCapture:
 
     @property
     def contradicts_start(self) -> bool:
-        """True if the rests would determine an open-circuit voltage, but their charge contradicts the SOC by the first voltage."""
+        """True if the rests would determine an OCV, but their charge contradicts the SOC from the first voltage."""
         is_by_voltage = self.start.origin is StartOrigin.VOLTAGE
         return is_by_voltage and self.is_ocv_test and not self.slow_branches and not self.gives_ocv
 
@@ -98,10 +98,10 @@ def recognize(
     Raises:
         UserError: A capture has too few good samples, or the wrong sign of the current.
     """
-    loads = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
-    starts = starts_of(loads, cell, initial_soc)
+    cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
+    starts = starts_of(cleaned, cell, initial_soc)
     return [
-        _recognize(capture, load, start, cell) for capture, load, start in zip(captures, loads, starts, strict=True)
+        _recognize(capture, clean, start, cell) for capture, clean, start in zip(captures, cleaned, starts, strict=True)
     ]
 
 
@@ -109,11 +109,11 @@ def _recognize(capture: Columns, cleaned: CleanCapture, start: StartSoc, cell: C
     good = remove_glitches(capture.rows, capture.name)
     slow = tuple(slow_branches(good, capture.name, start))
     test = None if slow else _relaxation_test(capture, start.soc, cell)
-    # a test whose SOC is unknown, or contradicts the charge: it shows the kind of the capture
-    unplaced_test = None if slow or test is not None else _relaxation_test(capture, 1.0, cell)
+    # a test whose SOC is unknown or contradicts the charge still shows the kind of the capture
+    test_of_unknown_soc = None if slow or test is not None else _relaxation_test(capture, 1.0, cell)
     if slow:
         kind = " and ".join(branch.label(cell.cell.capacity_ah) for branch in slow)
-    elif (any_test := test or unplaced_test) is not None:
+    elif (any_test := test or test_of_unknown_soc) is not None:
         kind = f"{_kind_of_test(good, cell)}, {len(any_test.rests)} rests"
     else:
         kind = _kind_of_load(good, cell)
@@ -124,8 +124,8 @@ def _recognize(capture: Columns, cleaned: CleanCapture, start: StartSoc, cell: C
         slow_branches=slow,
         start=start,
         reaches_full=start.origin is StartOrigin.GIVEN or _highest_soc(slow, test, cell) >= MIN_HIGHEST_SOC,
-        is_ocv_test=bool(slow) or test is not None or unplaced_test is not None,
-        gives_ocv=_is_placed(slow, cell) or test is not None,
+        is_ocv_test=bool(slow) or test is not None or test_of_unknown_soc is not None,
+        gives_ocv=_are_curves_usable(slow, cell) or test is not None,
         measures_ocv=bool(slow) or (test is not None and _has_long_rests(test)),
         gives_resistances=not without_excitation(cleaned, cell),
         temperature_c=mean_temperature_c(good),
@@ -151,7 +151,7 @@ def _has_long_rests(test: RelaxationTest) -> bool:
     return sum(rest.duration_s >= MIN_OCV_REST_S for rest in test.rests) >= MIN_POINTS
 
 
-def _is_placed(slow: Sequence[SlowBranch], cell: CellModel) -> bool:
+def _are_curves_usable(slow: Sequence[SlowBranch], cell: CellModel) -> bool:
     """Return True if low-rate curves are long enough, and their SOC is known.
 
     It is known by the start of discharges; without a discharge, by the end of charges with a full cell.

@@ -24,7 +24,7 @@ MIN_STEPS = 5
 LONG_REST_S = 300.0
 """Duration of a rest after which the voltage is near the OCV [s]."""
 MAX_SOC_DEVIATION = 0.1
-"""Maximum deviation of the SOC by a rested voltage from the counted SOC. It is an error only if
+"""Maximum deviation of the SOC from a rested voltage from the counted SOC. It is an error only if
 ``MAX_VOLTAGE_DEVIATION_V`` is exceeded as well; both together are more than errors of the model explain."""
 MAX_VOLTAGE_DEVIATION_V = 0.1
 """Maximum deviation of a rested voltage from the OCV at the counted SOC, per cell [V]."""
@@ -38,102 +38,100 @@ MIN_SOC_CHANGE = 0.05
 """Minimum change of SOC over which the trend of the voltage shows the sign of the current."""
 
 
-def capture_contradictions(load: CleanCapture, cell: CellModel, initial_soc: float) -> list[str]:
+def capture_contradictions(capture: CleanCapture, cell: CellModel, initial_soc: float) -> list[str]:
     """Return one line on the first contradiction, with a remedy, or an empty list.
 
     Later contradictions are usually consequences of the first.
 
     Args:
-        load: The capture.
+        capture: The capture.
         cell: Cell of the cell file.
         initial_soc: SOC at the first sample, 0..1.
     """
     contradiction = (
-        _too_short(load)
-        or _no_excitation(load, cell)
-        or _wrong_sign(load, cell)
-        or _unresponsive_voltage(load, cell)
-        or _gap_with_charge(load, cell)
-        or _wrong_capacity(load, cell, initial_soc)
+        _too_short(capture)
+        or _no_excitation(capture, cell)
+        or _wrong_sign(capture, cell)
+        or _unresponsive_voltage(capture, cell)
+        or _gap_with_charge(capture, cell)
+        or _wrong_capacity(capture, cell, initial_soc)
     )
-    return [f"{load.name}: {contradiction}"] if contradiction else []
+    return [f"{capture.name}: {contradiction}"] if contradiction else []
 
 
-def without_excitation(load: CleanCapture, cell: CellModel) -> bool:
+def without_excitation(capture: CleanCapture, cell: CellModel) -> bool:
     """Return True if the current is too small to determine the resistances."""
-    return _no_excitation(load, cell) is not None
+    return _no_excitation(capture, cell) is not None
 
 
-def step_resistance(load: CleanCapture) -> float | None:
+def step_resistance(capture: CleanCapture) -> float | None:
     """Return the median of -dV/dI over the current steps [ohm]; negative for a wrong sign, None for too few steps."""
-    change_a = np.diff(load.current_a)
-    largest_a = float(np.abs(load.current_a).max(initial=0.0))
-    steps = (np.abs(change_a) > STEP_FRACTION * largest_a) & (np.diff(load.time_s) <= MAX_STEP_S)
-    steps &= ~(load.mismatched[:-1] | load.mismatched[1:])
+    change_a = np.diff(capture.current_a)
+    largest_a = float(np.abs(capture.current_a).max(initial=0.0))
+    steps = (np.abs(change_a) > STEP_FRACTION * largest_a) & (np.diff(capture.time_s) <= MAX_STEP_S)
+    steps &= ~(capture.mismatched[:-1] | capture.mismatched[1:])
     if steps.sum() < MIN_STEPS:
         return None
-    return float(np.median(-np.diff(load.voltage_v)[steps] / change_a[steps]))
+    return float(np.median(-np.diff(capture.voltage_v)[steps] / change_a[steps]))
 
 
-def soc_outside(load: CleanCapture, cell: CellModel, initial_soc: float) -> str | None:
+def soc_outside(capture: CleanCapture, cell: CellModel, initial_soc: float) -> str | None:
     """Return a message if SOC, counted from ``initial_soc``, leaves 0..1; None if it stays within."""
     capacity_ah = cell.cell.capacity_ah
-    soc = initial_soc - load.discharged_ah / capacity_ah
+    soc = initial_soc - capture.discharged_ah / capacity_ah
     slack = 2.0 * SOC_SLACK
     if soc.min() >= -slack and soc.max() <= 1.0 + slack:
         return None
     return (
         f"SOC runs from {soc.min():.3f} to {soc.max():.3f}, outside 0..1: from {initial_soc:.3f} at the start "
-        f"({load.start_v:.3f} V), {np.ptp(load.discharged_ah):.3f} Ah were moved with a capacity of "
-        f"{capacity_ah:g} Ah; give {_start_remedy(load, cell)}the right capacity (--capacity-ah), or the OCV of this cell"
+        f"({capture.start_v:.3f} V), {np.ptp(capture.discharged_ah):.3f} Ah were moved with a capacity of "
+        f"{capacity_ah:g} Ah; give {_start_remedy(capture, cell)}the right capacity (--capacity-ah), or the OCV of this cell"
     )
 
 
-def _start_remedy(load: CleanCapture, cell: CellModel) -> str:
+def _start_remedy(capture: CleanCapture, cell: CellModel) -> str:
     """Return the remedy for a first rest on a plateau of the OCV, which does not determine the SOC; otherwise an empty text."""
-    undetermined = undetermined_start(load, cell)
+    undetermined = undetermined_start(capture, cell)
     return f"the SOC at the start (--soc), because {undetermined}; or " if undetermined else ""
 
 
-def _too_short(load: CleanCapture) -> str | None:
-    if load.time_s[-1] >= MIN_DURATION_S:
+def _too_short(capture: CleanCapture) -> str | None:
+    if capture.time_s[-1] >= MIN_DURATION_S:
         return None
-    return (
-        f"it lasts {load.time_s[-1]:.3g} s, at least {MIN_DURATION_S:g} s are needed: check that time_s is in seconds"
-    )
+    return f"it lasts {capture.time_s[-1]:.3g} s, at least {MIN_DURATION_S:g} s are needed: check that time_s is in seconds"
 
 
-def _no_excitation(load: CleanCapture, cell: CellModel) -> str | None:
-    largest_a = float(np.abs(load.current_a).max())
+def _no_excitation(capture: CleanCapture, cell: CellModel) -> str | None:
+    largest_a = float(np.abs(capture.current_a).max())
     min_a = MIN_PEAK_C_RATE * cell.cell.capacity_ah
     if largest_a >= min_a:
         return None
     return (
-        f"no excitation: the current never exceeds {largest_a:.4f} A in {load.time_s[-1] / 3600.0:.2f} h, and at least "
+        f"no excitation: the current never exceeds {largest_a:.4f} A in {capture.time_s[-1] / 3600.0:.2f} h, and at least "
         f"{min_a:.4f} A ({MIN_PEAK_C_RATE:g} C) is needed; record a load with steps and rests"
     )
 
 
-def _wrong_sign(load: CleanCapture, cell: CellModel) -> str | None:
+def _wrong_sign(capture: CleanCapture, cell: CellModel) -> str | None:
     """Return a message if the voltage shows the wrong sign of the current, by its steps or by the trend over SOC."""
-    ohm = step_resistance(load)
+    ohm = step_resistance(capture)
     if ohm is not None and ohm < 0.0:
         return (
             f"the current's sign is wrong: at its steps the voltage rises with the current, by {-1e3 * ohm:.1f} mV per "
             "ampere (median); discharge must be positive (--current-sign)"
         )
-    soc = -load.discharged_ah / cell.cell.capacity_ah
-    if ohm is None and np.ptp(soc) > MIN_SOC_CHANGE and np.cov(soc, load.voltage_v)[0, 1] < 0.0:
+    soc = -capture.discharged_ah / cell.cell.capacity_ah
+    if ohm is None and np.ptp(soc) > MIN_SOC_CHANGE and np.cov(soc, capture.voltage_v)[0, 1] < 0.0:
         return (
-            f"the current's sign is wrong: {load.discharged_ah[-1]:.3f} Ah drawn while the voltage went from "
-            f"{load.voltage_v[0]:.3f} to {load.voltage_v[-1]:.3f} V; discharge must be positive (--current-sign)"
+            f"the current's sign is wrong: {capture.discharged_ah[-1]:.3f} Ah drawn while the voltage went from "
+            f"{capture.voltage_v[0]:.3f} to {capture.voltage_v[-1]:.3f} V; discharge must be positive (--current-sign)"
         )
     return None
 
 
-def _unresponsive_voltage(load: CleanCapture, cell: CellModel) -> str | None:
-    ohm, min_ohm = step_resistance(load), MIN_RESPONSE_V * cell.cell.series_count / cell.cell.capacity_ah
-    if np.ptp(load.voltage_v) == 0.0:
+def _unresponsive_voltage(capture: CleanCapture, cell: CellModel) -> str | None:
+    ohm, min_ohm = step_resistance(capture), MIN_RESPONSE_V * cell.cell.series_count / cell.cell.capacity_ah
+    if np.ptp(capture.voltage_v) == 0.0:
         response = "is constant"
     elif ohm is not None and ohm < min_ohm:
         response = f"changes by {1e3 * ohm:.3f} mV per ampere at the current's steps (median)"
@@ -142,42 +140,42 @@ def _unresponsive_voltage(load: CleanCapture, cell: CellModel) -> str | None:
     return f"the voltage {response}, so it does not belong to this current; check the column for repeated old values"
 
 
-def _gap_with_charge(load: CleanCapture, cell: CellModel) -> str | None:
+def _gap_with_charge(capture: CleanCapture, cell: CellModel) -> str | None:
     """Return a message on the first gap over which an unknown charge flowed.
 
     A current that ended or changed its sign in the gap counts as no charge. If charge flowed nevertheless, the voltages of
     later rests contradict the counted SOC.
     """
-    step_s = np.diff(load.time_s)
-    charge_ah = np.abs(smaller_current_a(load.current_a)) * step_s / 3600.0
+    step_s = np.diff(capture.time_s)
+    charge_ah = np.abs(smaller_current_a(capture.current_a)) * step_s / 3600.0
     gaps = (step_s > MIN_GAP_PERIODS * np.median(step_s)) & (charge_ah > MIN_GAP_CHARGE * cell.cell.capacity_ah)
     if not gaps.any():
         return None
     j = int(np.argmax(gaps))
     return (
-        f"a gap of {step_s[j]:.0f} s at {load.time_s[j]:.0f} s, under {load.current_a[j]:.3f} A: the charge drawn in it "
+        f"a gap of {step_s[j]:.0f} s at {capture.time_s[j]:.0f} s, under {capture.current_a[j]:.3f} A: the charge drawn in it "
         f"is unknown (up to {charge_ah[j]:.3f} Ah); cut the capture there and give its parts"
     )
 
 
-def _wrong_capacity(load: CleanCapture, cell: CellModel, initial_soc: float) -> str | None:
+def _wrong_capacity(capture: CleanCapture, cell: CellModel, initial_soc: float) -> str | None:
     """Return a message if the counted SOC leaves 0..1 or contradicts the voltage of a long rest."""
     capacity_ah, grid = cell.cell.capacity_ah, ocv_grid(cell)
-    outside = soc_outside(load, cell, initial_soc)
+    outside = soc_outside(capture, cell, initial_soc)
     if outside:
         return outside
-    soc = initial_soc - load.discharged_ah / capacity_ah
-    for j in ends_of_long_rests(load.time_s, load.current_a, capacity_ah):
-        rested_v = float(load.voltage_v[j])
+    soc = initial_soc - capture.discharged_ah / capacity_ah
+    for j in ends_of_long_rests(capture.time_s, capture.current_a, capacity_ah):
+        rested_v = float(capture.voltage_v[j])
         expected_v, rested_soc = ocv(soc[j], *grid), soc_from_ocv(rested_v, *grid)
         if (
             abs(rested_v - expected_v) > MAX_VOLTAGE_DEVIATION_V * cell.cell.series_count
             and abs(rested_soc - soc[j]) > MAX_SOC_DEVIATION
         ):
             return (
-                f"charge and voltage disagree: after {load.discharged_ah[j]:.3f} Ah, at rest at {load.time_s[j]:.0f} s, "
+                f"charge and voltage disagree: after {capture.discharged_ah[j]:.3f} Ah, at rest at {capture.time_s[j]:.0f} s, "
                 f"SOC is {soc[j]:.3f} by the charge and a capacity of {capacity_ah:g} Ah, but {rested_soc:.3f} by "
-                f"{rested_v:.3f} V; give {_start_remedy(load, cell)}the right capacity, or find this cell's OCV with `ocv`"
+                f"{rested_v:.3f} V; give {_start_remedy(capture, cell)}the right capacity, or find this cell's OCV with `ocv`"
             )
     return None
 

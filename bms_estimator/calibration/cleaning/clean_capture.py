@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.mismatched_steps import are_mismatched, with_matched_voltages
-from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, selected
+from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, select_samples
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.charge_count import charge_ah
@@ -101,7 +101,7 @@ def _within_limits(name: str, samples: SampleBlock, cell: CellModel) -> SampleBl
     """
     limits = cell.cell
     voltage_v, current_a = samples["voltage_v"], samples["current_a"]
-    good = selected(
+    good = select_samples(
         samples,
         (voltage_v >= limits.voltage_min_v)
         & (voltage_v <= limits.voltage_max_v)
@@ -129,7 +129,7 @@ def _without_spikes(samples: SampleBlock, cell: CellModel) -> SampleBlock:
     current_spike = (deviation_a > SPIKE_C * cell.cell.capacity_ah) & (
         deviation_v < UNCHANGED_FRACTION * max_ohm * deviation_a
     )
-    return selected(samples, ~(voltage_spike | current_spike))
+    return select_samples(samples, ~(voltage_spike | current_spike))
 
 
 def _deviation_from_median(values: Floats) -> Floats:

@@ -21,7 +21,7 @@ class DataQuality:
         duration_s: Time from the first to the last sample [s].
         period_s: Median time between two samples [s]; NaN for fewer than two.
         period_percentiles_s: 1st and 99th percentile of the time between two samples [s].
-        gaps: Number of intervals longer than ``time_faults.gap_s``.
+        gaps: Number of intervals longer than ``charge_count.gap_s``.
         longest_gap_s: Longest interval between two samples [s].
         backward_steps: Number of samples whose time is before the previous sample's time.
         repeated_times: Number of samples with the time of the previous sample.

@@ -39,7 +39,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
         UserError: Nothing is left, most voltages are glitches, or the time goes back.
     """
     finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
-    good = selected(samples, finite)
+    good = select_samples(samples, finite)
     if good.size == 0:
         raise UserError(f"{name}: none of {samples.size} samples has finite time, current and voltage")
     positive_v = good["voltage_v"][good["voltage_v"] > 0.0]
@@ -55,7 +55,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
             f"{name}: {is_glitch.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
             f"{first['voltage_v']:.3f} V where the median is {median_v:.3f} V: check the sensor's wiring"
         )
-    good = selected(good, ~is_glitch)
+    good = select_samples(good, ~is_glitch)
     latest = np.maximum.accumulate(good["time_s"])
     is_earlier = good["time_s"] < latest
     if is_earlier.mean() > MAX_BACKWARD_FRACTION:
@@ -66,10 +66,10 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
             "contains several captures, or a clock was set; give each stretch as a file of its own"
         )
     is_later = np.r_[True, good["time_s"][1:] > latest[:-1]]
-    return selected(good, is_later)
+    return select_samples(good, is_later)
 
 
-def selected(samples: SampleBlock, mask: NDArray[np.bool_]) -> SampleBlock:
+def select_samples(samples: SampleBlock, mask: NDArray[np.bool_]) -> SampleBlock:
     """Return the samples for which ``mask`` is True: ``samples`` itself if all are, because a long capture is large."""
     return samples if mask.all() else samples[mask]
 
@@ -111,6 +111,6 @@ def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def mean_temperature_c(samples: SampleBlock) -> float:
-    """Return the mean of the reported temperatures [C], NaN without any."""
+    """Return the mean of the reported temperatures [C]; NaN without a sensor."""
     reported_c = samples["temperature_c"][np.isfinite(samples["temperature_c"])]
     return float(reported_c.mean()) if reported_c.size else float("nan")

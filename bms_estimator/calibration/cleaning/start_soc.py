@@ -13,7 +13,7 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, r_s, soc_from_ocv
 from bms_estimator.model.cell import CellModel, TableOcv, generic_cells, load_cell
 
 FULL_SOC = 0.97
-"""Minimum SOC by the voltage of the first rest at which the cell counts as full. Rested full cells of one type differ by some
+"""Minimum SOC from the voltage of the first rest at which the cell counts as full. Rested full cells of one type differ by some
 30 mV, and cells rest 20 to 50 mV below the voltage at the end of their charge."""
 MAX_RANGE = 0.3
 """Maximum width of the range of SOCs that fit a voltage, if the voltage determines the SOC. With generic cells the width is
@@ -24,8 +24,8 @@ SAME_START_V = 0.02
 """Maximum difference of the first rests of captures that start at the same SOC, per cell [V]. Full charges vary by as
 much."""
 MAX_EXCESS = 0.1
-"""Maximum discharged charge above the initial charge by the voltage, as a fraction of the capacity. A larger excess shows that
-the OCV curve is of another chemistry."""
+"""Maximum discharged charge above the initial charge that the voltage indicates, as a fraction of the capacity. A larger excess
+shows that the OCV curve is of another chemistry."""
 MAX_MEDIAN_DIFFERENCE_V = 0.15
 """Maximum difference between the median voltage of a capture and the OCV at SOC 0.5 of a cell of its chemistry [V]."""
 
@@ -61,62 +61,62 @@ class StartSoc:
         return self.origin in (StartOrigin.GIVEN, StartOrigin.FULL)
 
 
-def starts_of(loads: Sequence[CleanCapture], cell: CellModel, initial_soc: float | None = None) -> list[StartSoc]:
+def starts_of(captures: Sequence[CleanCapture], cell: CellModel, initial_soc: float | None = None) -> list[StartSoc]:
     """Return the SOC at the first sample of each capture.
 
     Args:
-        loads: Captures of one cell.
+        captures: Captures of one cell.
         cell: Cell whose OCV gives the SOC of a rest.
         initial_soc: SOC 0..1 of the captures that start at the highest voltage; None: their voltages determine it.
     """
-    highest_v = max(load.start_v for load in loads) - SAME_START_V * cell.cell.series_count
-    return [_start_of(load, cell, initial_soc if load.start_v >= highest_v else None) for load in loads]
+    highest_v = max(capture.start_v for capture in captures) - SAME_START_V * cell.cell.series_count
+    return [_start_of(capture, cell, initial_soc if capture.start_v >= highest_v else None) for capture in captures]
 
 
-def initial_soc(load: CleanCapture, cell: CellModel) -> float:
+def initial_soc(capture: CleanCapture, cell: CellModel) -> float:
     """Return the SOC whose OCV is the voltage of the first rest or, without a rest, the first voltage plus i R_s."""
-    return soc_from_ocv(_open_circuit_v(load, cell), *ocv_grid(cell))
+    return soc_from_ocv(_open_circuit_v(capture, cell), *ocv_grid(cell))
 
 
-def undetermined_start(load: CleanCapture, cell: CellModel) -> str | None:
+def undetermined_start(capture: CleanCapture, cell: CellModel) -> str | None:
     """Return the SOCs that the voltage of the first rest allows, as text; None if it determines the SOC."""
-    low, high = _soc_range(load, cell)
-    return _range_text(load, low, high) if high - low > MAX_RANGE else None
+    low, high = _soc_range(capture, cell)
+    return _range_text(capture, low, high) if high - low > MAX_RANGE else None
 
 
-def _start_of(load: CleanCapture, cell: CellModel, given: float | None) -> StartSoc:
-    low, high = _soc_range(load, cell)
-    soc, full_v = initial_soc(load, cell), ocv(FULL_SOC, *ocv_grid(cell))
-    reason = _range_text(load, low, high)
+def _start_of(capture: CleanCapture, cell: CellModel, given: float | None) -> StartSoc:
+    low, high = _soc_range(capture, cell)
+    soc, full_v = initial_soc(capture, cell), ocv(FULL_SOC, *ocv_grid(cell))
+    reason = _range_text(capture, low, high)
     if given is not None:
         return StartSoc(given, StartOrigin.GIVEN, full_v, reason)
-    if soc >= FULL_SOC or _is_full_of_another_chemistry(load, cell, soc):
-        return StartSoc(1.0, StartOrigin.FULL, min(full_v, load.start_v), reason)
+    if soc >= FULL_SOC or _is_full_of_another_chemistry(capture, cell, soc):
+        return StartSoc(1.0, StartOrigin.FULL, min(full_v, capture.start_v), reason)
     if high - low > MAX_RANGE:
         return StartSoc(math.nan, StartOrigin.UNKNOWN, full_v, reason)
     return StartSoc(soc, StartOrigin.VOLTAGE, full_v, reason)
 
 
-def _is_full_of_another_chemistry(load: CleanCapture, cell: CellModel, soc: float) -> bool:
+def _is_full_of_another_chemistry(capture: CleanCapture, cell: CellModel, soc: float) -> bool:
     """Return True if the capture draws more charge than ``soc`` allows, and its voltages fit a full generic cell."""
     capacity_ah, series = cell.cell.capacity_ah, cell.cell.series_count
-    if load.discharged_ah.max() < (soc + MAX_EXCESS) * capacity_ah:
+    if capture.discharged_ah.max() < (soc + MAX_EXCESS) * capacity_ah:
         return False
-    median_v = float(np.median(load.voltage_v))
+    median_v = float(np.median(capture.voltage_v))
     grids = [ocv_grid(load_cell(name, capacity_ah).pack(series, 1)) for name in generic_cells()]
     return any(
-        soc_from_ocv(load.start_v, *grid) >= FULL_SOC
+        soc_from_ocv(capture.start_v, *grid) >= FULL_SOC
         and abs(median_v - ocv(0.5, *grid)) < MAX_MEDIAN_DIFFERENCE_V * series
         for grid in grids
     )
 
 
-def _open_circuit_v(load: CleanCapture, cell: CellModel) -> float:
-    current_a = 0.0 if load.resting_samples else float(load.current_a[0])
-    return load.start_v + current_a * r_s(0.5, cell.a)
+def _open_circuit_v(capture: CleanCapture, cell: CellModel) -> float:
+    current_a = 0.0 if capture.resting_samples else float(capture.current_a[0])
+    return capture.start_v + current_a * r_s(0.5, cell.a)
 
 
-def _soc_range(load: CleanCapture, cell: CellModel) -> tuple[float, float]:
+def _soc_range(capture: CleanCapture, cell: CellModel) -> tuple[float, float]:
     """Return the lowest and the highest SOC whose OCV agrees with the first voltage within the OCV's error and hysteresis."""
     grid_v = ocv_grid(cell)[0]
     soc = np.linspace(0.0, 1.0, grid_v.size)
@@ -126,11 +126,11 @@ def _soc_range(load: CleanCapture, cell: CellModel) -> tuple[float, float]:
             tolerance_v = np.interp(soc, cell.ocv.soc, cell.ocv.error_v)
         if cell.ocv.hysteresis_v is not None:
             tolerance_v += np.interp(soc, cell.ocv.soc, cell.ocv.hysteresis_v)
-    allowed = soc[np.abs(grid_v - _open_circuit_v(load, cell)) <= tolerance_v]
-    nearest = initial_soc(load, cell)
+    allowed = soc[np.abs(grid_v - _open_circuit_v(capture, cell)) <= tolerance_v]
+    nearest = initial_soc(capture, cell)
     return min(nearest, float(allowed.min(initial=1.0))), max(nearest, float(allowed.max(initial=0.0)))
 
 
-def _range_text(load: CleanCapture, low: float, high: float) -> str:
-    begins = "its first rest" if load.resting_samples else "its first sample"
-    return f"{begins} at {load.start_v:.3f} V fits SOC {low:.2f} to {high:.2f}"
+def _range_text(capture: CleanCapture, low: float, high: float) -> str:
+    begins = "its first rest" if capture.resting_samples else "its first sample"
+    return f"{begins} at {capture.start_v:.3f} V fits SOC {low:.2f} to {high:.2f}"

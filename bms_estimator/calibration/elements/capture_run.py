@@ -18,7 +18,7 @@ FULL_TOLERANCE_V = 0.03
 """Maximum distance of the voltage of a first rest from the voltage of a full cell at which the capture counts as starting
 full, per cell [V]. This rule applies only away from 25 C, because cold rests are not relaxed and their voltage gives a
 wrong SOC."""
-COLD_K = 5.0
+MIN_DEVIATION_K = 5.0
 """Minimum deviation from 25 C at which ``FULL_TOLERANCE_V`` applies [K]."""
 MIN_CELL_C = -45.0
 """Lowest plausible cell temperature [C]."""
@@ -32,22 +32,22 @@ PERCENTILES = (2.0, 98.0)
 class Run:
     """Cleaned capture with the SOC (0..1) and the temperature [C] at each sample."""
 
-    load: CleanCapture
+    capture: CleanCapture
     soc: Floats
     temperature_c: Floats
     miscount: float = 0.0
     """Relative correction of the counted charge. ``soc`` includes the correction."""
 
-    def recounted(self, added: float) -> "Run":
+    def with_added_miscount(self, added: float) -> "Run":
         """Return a copy with ``miscount`` increased by ``added`` and the changes of ``soc`` rescaled accordingly."""
         miscount = self.miscount + added
         uncorrected_change = (self.soc - self.soc[0]) / (1.0 + self.miscount)
         return replace(self, soc=self.soc[0] + (1.0 + miscount) * uncorrected_change, miscount=miscount)
 
     @property
-    def load_with_temperature(self) -> CleanCapture:
-        """``load`` with the temperatures replaced by ``temperature_c``."""
-        return replace(self.load, temperature_c=self.temperature_c)
+    def capture_with_temperature(self) -> CleanCapture:
+        """``capture`` with the temperatures replaced by ``temperature_c``."""
+        return replace(self.capture, temperature_c=self.temperature_c)
 
     @property
     def mean_c(self) -> float:
@@ -55,26 +55,30 @@ class Run:
         return float(self.temperature_c.mean())
 
 
-def make_run(load: CleanCapture, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
-    """Return a capture with its SOC by coulomb counting from ``soc``. None: from its first rest."""
+def make_run(capture: CleanCapture, cell: CellModel, soc: float | None, temperature_c: float | None) -> Run:
+    """Return a capture with its SOC by coulomb counting from ``soc``, or from the SOC of its first rest if None."""
     if temperature_c is not None:
-        load = replace(load, temperature_c=temperature_of(load, temperature_c))
-    temperature = temperature_of(load)
-    first_soc = initial_soc(load, cell) if soc is None else soc
+        capture = replace(capture, temperature_c=temperature_of(capture, temperature_c))
+    temperature = temperature_of(capture)
+    first_soc = initial_soc(capture, cell) if soc is None else soc
     full_v = ocv_grid(cell)[0][-1]
-    is_cold = abs(float(temperature[0]) - REFERENCE_C) > COLD_K
-    if soc is None and is_cold and abs(full_v - load.start_v) < FULL_TOLERANCE_V * cell.cell.series_count:
+    is_far_from_reference = abs(float(temperature[0]) - REFERENCE_C) > MIN_DEVIATION_K
+    if (
+        soc is None
+        and is_far_from_reference
+        and abs(full_v - capture.start_v) < FULL_TOLERANCE_V * cell.cell.series_count
+    ):
         first_soc = 1.0
-    return Run(load, first_soc - load.discharged_ah / cell.cell.capacity_ah, temperature)
+    return Run(capture, first_soc - capture.discharged_ah / cell.cell.capacity_ah, temperature)
 
 
-def wrong_temperature(load: CleanCapture, temperature_c: float | None) -> list[str]:
+def temperature_contradictions(capture: CleanCapture, temperature_c: float | None) -> list[str]:
     """Return a message if the temperature of a capture is implausible."""
-    temperature = temperature_of(load, REFERENCE_C if temperature_c is None else temperature_c)
+    temperature = temperature_of(capture, REFERENCE_C if temperature_c is None else temperature_c)
     if temperature.min() >= MIN_CELL_C and temperature.max() <= MAX_CELL_C:
         return []
     measured = f"temperature_c runs from {temperature.min():.1f} to {temperature.max():.1f}"
-    return [f"{load.name}: {measured}, but cells are between {MIN_CELL_C:g} and {MAX_CELL_C:g} C"]
+    return [f"{capture.name}: {measured}, but cells are between {MIN_CELL_C:g} and {MAX_CELL_C:g} C"]
 
 
 def temperature_range(runs: list[Run]) -> tuple[float, float]:

@@ -43,7 +43,7 @@ def cell_from_fit(
     given_ladder = given.ladder
     if not has_span and given_ladder is not None and given_ladder.std < GENERIC_STD:
         low_c, high_c = min(low_c, given_ladder.temperature_c[0]), max(high_c, given_ladder.temperature_c[1])
-    ohm, ohm_std = fit.branches(0.5, 0, RESISTANCES)
+    ohm, ohm_std = fit.resistance_sum(0.5, 0, RESISTANCES)
     ladder = Ladder(
         soc=_tuple(SOC_NODES),
         weak_ohm=tuple(map(_tuple, fit.weak_ohm)),
@@ -64,9 +64,9 @@ def voltage_rms_v(cell: CellModel, run: Run) -> float:
     """Return the RMS error of the cell's voltage on a capture, weighted by time and scaled to 25 C [V]."""
     grid_v = ocv_grid(cell)[0]
     e_o = np.interp(run.soc, np.linspace(0.0, 1.0, grid_v.size), grid_v)
-    error_v = run.load.voltage_v - e_o + overpotential(cell, run.load_with_temperature, run.soc)
-    weight = np.clip(np.diff(run.load.time_s, append=run.load.time_s[-1]), 0.0, MAX_STEP_S)
-    weight *= ((run.soc > MIN_RMS_SOC) & ~run.load.mismatched) / arrhenius(
+    error_v = run.capture.voltage_v - e_o + overpotential(cell, run.capture_with_temperature, run.soc)
+    weight = np.clip(np.diff(run.capture.time_s, append=run.capture.time_s[-1]), 0.0, MAX_STEP_S)
+    weight *= ((run.soc > MIN_RMS_SOC) & ~run.capture.mismatched) / arrhenius(
         0.5 * HIGH_ACTIVATION_ENERGY, run.temperature_c
     ) ** 2
     return float(np.sqrt((weight * error_v**2).sum() / max(weight.sum(), 1e-12)))
@@ -77,7 +77,7 @@ def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOc
     given = cell.ocv if isinstance(cell.ocv, TableOcv) else None
     soc = np.linspace(0.0, 1.0, round(1.0 / OCV_STEP) + 1)
     grid_v = ocv_grid(cell)[0]
-    slope = MIN_SLOPE_V * cell.cell.series_count * soc
+    min_rise_v = MIN_SLOPE_V * cell.cell.series_count * soc
     corrected_v = np.interp(soc, np.linspace(0.0, 1.0, grid_v.size), grid_v) + correction_at(soc) @ fit.correction
     per_kelvin_v = linear_interpolation_matrix(soc, KELVIN_NODES) @ fit.per_kelvin_v if entropy else None
     if given is not None and given.per_kelvin_v is not None:
@@ -87,7 +87,7 @@ def _corrected_ocv(cell: CellModel, fit: LadderFit, *, entropy: bool) -> TableOc
     return TableOcv(
         form="table",
         soc=_tuple(soc),
-        ocv_v=_tuple(np.maximum.accumulate(corrected_v - slope) + slope),
+        ocv_v=_tuple(np.maximum.accumulate(corrected_v - min_rise_v) + min_rise_v),
         error_v=_tuple(np.interp(soc, EVEN_SOC, ocv_error(cell))),
         hysteresis_v=None if hysteresis_v is None or given is None else _tuple(np.interp(soc, given.soc, hysteresis_v)),
         per_kelvin_v=None if per_kelvin_v is None else _tuple(per_kelvin_v),

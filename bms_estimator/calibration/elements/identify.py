@@ -25,8 +25,8 @@ from bms_estimator.calibration.elements.capture_run import (
     Run,
     make_run,
     spans_temperature,
+    temperature_contradictions,
     temperature_range,
-    wrong_temperature,
 )
 from bms_estimator.calibration.elements.cell_from_fit import MIN_RMS_SOC, cell_from_fit, voltage_rms_v
 from bms_estimator.calibration.elements.identification import CaptureFit, Identification
@@ -82,11 +82,11 @@ class Candidate:
         """
         fits = tuple(
             CaptureFit(
-                name=run.load.name,
-                samples=run.load.samples,
-                glitches=run.load.glitches,
+                name=run.capture.name,
+                samples=run.capture.samples,
+                glitches=run.capture.glitches,
                 initial_soc=float(run.soc[0]),
-                temperature_c=temperature_range([run]) if np.isfinite(run.load.temperature_c).any() else None,
+                temperature_c=temperature_range([run]) if np.isfinite(run.capture.temperature_c).any() else None,
                 miscount=run.miscount,
                 voltage_rms_v=voltage_rms_v(self.cell, run),
                 score_before=float(before[j]),
@@ -99,7 +99,7 @@ class Candidate:
         return Identification(
             cell=self.cell,
             elements={
-                soc: {name: self.fit.branches(soc, *indices) for name, indices in two_branch_fit.SECTIONS.items()}
+                soc: {name: self.fit.resistance_sum(soc, *indices) for name, indices in two_branch_fit.SECTIONS.items()}
                 for soc in REPORTED_SOC
             },
             captures=fits,
@@ -110,21 +110,21 @@ class Candidate:
         )
 
     def cell_for(self, j: int) -> CellModel:
-        """Return the cell that is scored by capture ``j``: of a fit without this capture if it is held back."""
+        """Return the cell whose score capture ``j`` determines. Its fit omits this capture if it is held back."""
         if not self.is_held_back(j):
             return self.cell
         others = [k for k in range(len(self._runs)) if k != j]
         return self._cell_from(self._fit(others), others)
 
-    def _fit(self, which: Sequence[int]) -> LadderFit:
-        """Fit the resistances to the captures ``which``."""
-        has_span = spans_temperature(*temperature_range([self._runs[k] for k in which]))
+    def _fit(self, indices: Sequence[int]) -> LadderFit:
+        """Fit the resistances to some captures."""
+        has_span = spans_temperature(*temperature_range([self._runs[k] for k in indices]))
         prior = ladder_prior(self._cell, self._scale_ohm, refine_ocv=self._refine, spans_temperature=has_span)
-        return fit_ladder([self._equations[k] for k in which], prior)
+        return fit_ladder([self._equations[k] for k in indices], prior)
 
-    def _cell_from(self, fit: LadderFit, which: Sequence[int]) -> CellModel:
-        """Return the cell with the fit to the captures ``which``."""
-        runs = [self._runs[k] for k in which]
+    def _cell_from(self, fit: LadderFit, indices: Sequence[int]) -> CellModel:
+        """Return the cell with the fit to some captures."""
+        runs = [self._runs[k] for k in indices]
         return cell_from_fit(self._cell, fit, runs, self._scale_ohm, refine_ocv=self._refine)
 
 
@@ -135,9 +135,9 @@ def equations_of(runs: list[Run], cell: CellModel) -> list[NormalEquations]:
     grid = np.linspace(0.0, 1.0, grid_v.size)
     return [
         normal_equations(
-            run.load,
+            run.capture,
             run.soc,
-            np.interp(run.soc, grid, grid_v) + ocv_offset(cell, run.load_with_temperature, run.soc),
+            np.interp(run.soc, grid, grid_v) + ocv_offset(cell, run.capture_with_temperature, run.soc),
             np.interp(run.soc, grid, grid_slope_v),
             run.temperature_c,
             scale_ohm,
@@ -150,7 +150,7 @@ def equations_of(runs: list[Run], cell: CellModel) -> list[NormalEquations]:
 
 def _resistance_scale(runs: list[Run], cell: CellModel) -> float:
     """Return the scale of the resistances [ohm]: the median of the current steps, or a typical value without steps."""
-    steps = [ohm for ohm in (step_resistance(run.load) for run in runs) if ohm is not None]
+    steps = [ohm for ohm in (step_resistance(run.capture) for run in runs) if ohm is not None]
     return float(np.median(steps)) if steps else TYPICAL_DROP_V * cell.cell.series_count / cell.cell.capacity_ah
 
 
@@ -160,7 +160,7 @@ def geometric_mean(scores: Floats) -> float:
     return float(np.exp(np.log(finite).mean())) if finite.size else float("nan")
 
 
-COUNT_PASSES = 3
+MISCOUNT_PASSES = 3
 """Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a
 knee."""
 REGRESSION_WORK = 0.5
@@ -187,7 +187,7 @@ def identify(
             temperature.
         refine_ocv: Correct the open-circuit voltage as well if the correction improves the replays.
         initial_soc: SOC 0..1 at the first sample of each capture; None: from the voltage of its first rest.
-        initial_socs: SOC 0..1 at the first sample of some captures by name, which precedes ``initial_soc``.
+        initial_socs: SOC 0..1 at the first sample of some captures by name, which overrides ``initial_soc``.
         temperature_c: Temperature of captures without a sensor [C]; None: 25 C.
         progress: Receives the finished fraction of the work.
 
@@ -196,21 +196,23 @@ def identify(
             temperature is implausible, or replays get worse.
     """
     cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
-    loads = [load for load in cleaned if not without_excitation(load, cell)]
+    excited = [clean for clean in cleaned if not without_excitation(clean, cell)]
     # without any load, the checks below report the missing excitation
-    runs = [make_run(load, cell, initial_socs.get(load.name, initial_soc), temperature_c) for load in loads or cleaned]
-    contradictions = [line for run in runs for line in capture_contradictions(run.load, cell, float(run.soc[0]))]
-    contradictions += [line for load in loads for line in wrong_temperature(load, temperature_c)]
+    runs = [
+        make_run(clean, cell, initial_socs.get(clean.name, initial_soc), temperature_c) for clean in excited or cleaned
+    ]
+    contradictions = [line for run in runs for line in capture_contradictions(run.capture, cell, float(run.soc[0]))]
+    contradictions += [line for clean in excited for line in temperature_contradictions(clean, temperature_c)]
     if contradictions:
         raise UserError("\n".join(contradictions))
     variants = (False, True) if refine_ocv else (False,)  # with the given OCV, with a corrected OCV
     samples = sum(run.soc.size for run in runs)
-    work = WorkCounter(progress, (1 + len(variants) + REGRESSION_WORK * COUNT_PASSES) * samples)
-    runs = _recounted(runs, cell, work, refine_ocv=refine_ocv)
-    left_out = tuple(load.name for load in cleaned if without_excitation(load, cell))
+    work = WorkCounter(progress, (1 + len(variants) + REGRESSION_WORK * MISCOUNT_PASSES) * samples)
+    runs = _correct_miscounts(runs, cell, work, refine_ocv=refine_ocv)
+    left_out = tuple(clean.name for clean in cleaned if without_excitation(clean, cell))
     equations = equations_of(runs, cell)
     candidates = [Candidate(runs, equations, cell, refine_ocv=refine) for refine in variants]
-    before = np.array([interval_score(cell, run.load, run.soc, work.part(run.soc.size)) for run in runs])
+    before = np.array([interval_score(cell, run.capture, run.soc, work.part(run.soc.size)) for run in runs])
     after = [_scores(candidate, runs, work) for candidate in candidates]
     best = len(after) - 1  # the last candidate, if no capture has a score
     if np.isfinite(before).any():
@@ -221,11 +223,11 @@ def identify(
         )
         best = int((EQUAL_SCORE_RATIO if held_back else 1.0) * refined < given)  # index in ``candidates``
     outcome = candidates[best].outcome(before, after[best], left_out)
-    unknown = [load for load in loads if initial_soc is None and load.name not in initial_socs]
+    unknown = [clean for clean in excited if initial_soc is None and clean.name not in initial_socs]
     undetermined = tuple(
-        f"{load.name}: give the SOC at the start (--soc), because {text}"
-        for load in unknown
-        if (text := undetermined_start(load, cell))
+        f"{clean.name}: give the SOC at the start (--soc), because {text}"
+        for clean in unknown
+        if (text := undetermined_start(clean, cell))
     )
     if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before:
         raise UserError("\n".join([_worse_replays(outcome), *undetermined]))
@@ -236,17 +238,17 @@ def _scores(candidate: Candidate, runs: list[Run], work: WorkCounter) -> Floats:
     """Return the score of each capture's replays [%], by a fit without the capture if it is held back."""
     return np.array(
         [
-            interval_score(candidate.cell_for(j), run.load, run.soc, work.part(run.soc.size))
+            interval_score(candidate.cell_for(j), run.capture, run.soc, work.part(run.soc.size))
             for j, run in enumerate(runs)
         ]
     )
 
 
-def _recounted(runs: list[Run], cell: CellModel, work: WorkCounter, *, refine_ocv: bool) -> list[Run]:
+def _correct_miscounts(runs: list[Run], cell: CellModel, work: WorkCounter, *, refine_ocv: bool) -> list[Run]:
     """Return the captures with their counted charge rescaled so that knees of voltage and OCV coincide."""
-    for _ in range(COUNT_PASSES):
+    for _ in range(MISCOUNT_PASSES):
         miscounts = Candidate(runs, equations_of(runs, cell), cell, refine_ocv=refine_ocv).miscounts()
-        runs = [run.recounted(more) for run, more in zip(runs, miscounts, strict=True)]
+        runs = [run.with_added_miscount(added) for run, added in zip(runs, miscounts, strict=True)]
         work.part(REGRESSION_WORK * sum(run.soc.size for run in runs))(1.0)
     return runs
 

@@ -78,7 +78,7 @@ class LadderFit:
         parts = self.correction, self.per_kelvin_v, self.weak_ohm.ravel(), self.strong_ohm.ravel()
         return np.concatenate(parts)
 
-    def branches(self, soc: float, first: int, end: int) -> tuple[float, float]:
+    def resistance_sum(self, soc: float, first: int, end: int) -> tuple[float, float]:
         """Return the sum of resistances ``first`` to ``end`` - 1 at ``soc`` and 25 C, and its standard error [ohm]."""
         node_weights = linear_interpolation_matrix(np.array([soc]), SOC_NODES)[0]
         row = np.zeros((2, RESISTANCES, SOC_NODES.size))
@@ -96,7 +96,7 @@ class Prior:
         per_kelvin_v: Std of u [V/K]; ``FIXED_PER_KELVIN_STD_V`` if u is not fitted.
         scale_ohm: Scale of the resistances [ohm].
         series: Cells in series.
-        shapes: Shape (2, RESISTANCES, SOC_NODES.size), typical course of the weak and strong part of each resistance
+        shapes: Shape (2, RESISTANCES, SOC_NODES.size), typical values of the weak and strong part of each resistance
             over SOC, relative to a mean.
         weak_share: Shape (RESISTANCES, SOC_NODES.size), given fraction of each resistance that is the weak part; None:
             the captures determine it.
@@ -144,13 +144,13 @@ def _prior_information(prior: Prior) -> Floats:
     table[:SPLINES, :SPLINES] = deviation.T @ deviation + bend.T @ bend / OCV_INTERVALS
     table[SPLINES:UNBOUNDED, SPLINES:UNBOUNDED] = np.eye(KELVIN_NODES.size) / prior.per_kelvin_v**2
     for first, shape in zip((UNBOUNDED, UNBOUNDED + PART_SIZE), prior.shapes, strict=True):
-        rough = _rough_rows() / (ROUGHNESS_STD * prior.scale_ohm) / shape.ravel()
-        part = rough.T @ rough + LEVEL_PRECISION * np.eye(PART_SIZE) / prior.scale_ohm**2
+        roughness = _roughness_rows() / (ROUGHNESS_STD * prior.scale_ohm) / shape.ravel()
+        part = roughness.T @ roughness + LEVEL_PRECISION * np.eye(PART_SIZE) / prior.scale_ohm**2
         table[first : first + PART_SIZE, first : first + PART_SIZE] = part
     return table
 
 
-def _rough_rows() -> Floats:
+def _roughness_rows() -> Floats:
     """Return the differences of one part's resistances along SOC and between neighboring RC pairs, as rows."""
     unknowns = np.eye(PART_SIZE).reshape(RESISTANCES, SOC_NODES.size, PART_SIZE)  # index 0 is R_0, which is no RC pair
     std_factor = np.where(SOC_NODES < LOW_SOC, LOW_SOC_ROUGHNESS, 1.0)

@@ -12,7 +12,7 @@ from bms_estimator.calibration.elements.ladder_fit import (
     ZERO_FRACTION,
     Prior,
 )
-from bms_estimator.calibration.ocv.hysteresis import REST_SHARE_STD, has_plateau
+from bms_estimator.calibration.ocv.hysteresis import RESTED_FRACTION_STD, has_plateau
 from bms_estimator.calibration.ocv.slow_curve import PAIR_V
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V
 from bms_estimator.estimator.settings_records import ocv_grid
@@ -61,7 +61,7 @@ def ocv_error(cell: CellModel) -> Floats:
 def _shapes(cell: CellModel, scale_ohm: float) -> Floats:
     """Return the prior shape of the weak and strong part of each resistance over SOC, at ``SOC_NODES``.
 
-    The shape of an identified ladder is used unchanged. Of a generic ladder the square root of the shape is used,
+    The shape of an identified ladder is used unchanged. For a generic ladder, the square root of the shape is used,
     because cells differ. The shape is constant for a cell with a voltage plateau, because the generic shape did not
     fit the captures of an LFP cell.
     """
@@ -70,7 +70,7 @@ def _shapes(cell: CellModel, scale_ohm: float) -> Floats:
         return np.ones((2, RESISTANCES, SOC_NODES.size))
     rows = _at_nodes(given)
     mean_ohm = rows[:, :, SOC_NODES > SHAPE_MIN_SOC].mean(axis=2, keepdims=True)
-    is_zero = mean_ohm < ZERO_FRACTION * scale_ohm  # has no shape
+    is_zero = mean_ohm < ZERO_FRACTION * scale_ohm  # a resistance of 0 has no shape
     shapes = np.clip(np.where(is_zero, 1.0, rows / np.where(is_zero, 1.0, mean_ohm)), *SHAPE_LIMITS)
     return np.asarray(np.sqrt(shapes) if given.std >= GENERIC_STD else shapes)
 
@@ -96,7 +96,7 @@ def _curve_error(cell: CellModel) -> Floats:
     error_v = ocv_error(cell)
     if not isinstance(cell.ocv, TableOcv) or cell.ocv.hysteresis_v is None:
         return error_v
-    hysteresis_v = REST_SHARE_STD * np.interp(EVEN_SOC, cell.ocv.soc, cell.ocv.hysteresis_v)
+    hysteresis_v = RESTED_FRACTION_STD * np.interp(EVEN_SOC, cell.ocv.soc, cell.ocv.hysteresis_v)
     square_v2: Floats = np.maximum(error_v**2 - hysteresis_v**2, (PAIR_V * cell.cell.series_count) ** 2)
     return np.sqrt(square_v2)
 

@@ -89,7 +89,7 @@ class NormalEquations:
 
 
 def normal_equations(
-    load: CleanCapture,
+    capture: CleanCapture,
     soc: Floats,
     given_v: Floats,
     slope_v: Floats,
@@ -98,10 +98,10 @@ def normal_equations(
     series: int,
     miscount: float,
 ) -> NormalEquations:
-    """Return the normal equations of the regression over ``load``.
+    """Return the normal equations of the regression over ``capture``.
 
     Args:
-        load: Capture that starts at rest.
+        capture: Capture that starts at rest.
         soc: Shape (n,), counted SOC, corrected for ``miscount``.
         given_v: Shape (n,), the given OCV at SOC and temperature [V].
         slope_v: Shape (n,), slope dE_o/dSOC of the given OCV [V].
@@ -113,27 +113,27 @@ def normal_equations(
     Raises:
         UserError: No sample lies within ``MIN_SOC`` to ``MAX_SOC``.
     """
-    currents = np.column_stack([load.current_a, branch_currents(load.time_s, load.current_a)])  # x_0, x_1, ...
-    weight, is_rest_end = _weights(load)
+    currents = np.column_stack([capture.current_a, branch_currents(capture.time_s, capture.current_a)])  # x_0, x_1, ...
+    weight, is_rest_end = _weights(capture)
     inside = (soc > MIN_SOC) & (soc < MAX_SOC)
-    selected = (_first_of_each_slot(load.time_s) | is_rest_end) & inside & ~load.mismatched
+    selected = (_first_of_each_slot(capture.time_s) | is_rest_end) & inside & ~capture.mismatched
     if not selected.any():
         raise UserError(
-            f"{load.name}: no sample between SOC {MIN_SOC:g} and {MAX_SOC:g} [--soc], so that resistances are undetermined"
+            f"{capture.name}: no sample between SOC {MIN_SOC:g} and {MAX_SOC:g} [--soc], so that resistances are undetermined"
         )
     max_current_a = np.abs(currents[:, :4]).max(axis=1)  # of x_0 to x_3, see RELATIVE_STD
     std_v = arrhenius(ERROR_J, temperature_c) * np.hypot(ERROR_V * series, RELATIVE_STD * scale_ohm * max_current_a)
     std_v = np.hypot(std_v, SOC_STD * np.sqrt(np.abs(soc - soc[0])) * slope_v)
     weight = np.where(selected, weight, 0.0)
     root_weight = (np.sqrt(ROWS_PER_CAPTURE * weight / weight.sum()) / std_v)[selected]
-    residual_v = load.voltage_v - given_v
+    residual_v = capture.voltage_v - given_v
     rows = model_rows(soc[selected], temperature_c[selected], currents[selected]) * root_weight[:, None]
     target = residual_v[selected] * root_weight
     # the rows of voltage jumps: each is the difference between the samples after and before a clean step
-    is_after_step = _clean_steps(load) & inside
+    is_after_step = _clean_steps(capture) & inside
     is_before_step = np.r_[is_after_step[1:], False]
     if is_after_step.any():
-        change_a = np.abs(load.current_a[is_after_step] - load.current_a[is_before_step])
+        change_a = np.abs(capture.current_a[is_after_step] - capture.current_a[is_before_step])
         step_std_v = np.hypot(STEP_V * series, RELATIVE_STD * scale_ohm * change_a) * arrhenius(
             ERROR_J, temperature_c[is_after_step]
         )
@@ -161,32 +161,34 @@ def _first_of_each_slot(time_s: Floats) -> NDArray[np.bool_]:
     return np.asarray(np.r_[True, np.diff(slot) > 0.0], dtype=np.bool_)
 
 
-def _weights(load: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
+def _weights(capture: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the relative weight of each row, and a mask of the last rows of long rests."""
-    largest_a = float(np.abs(load.current_a).max())
-    step_s = np.clip(np.diff(load.time_s, append=load.time_s[-1] + 1.0), 0.0, MAX_ROW_S)
-    changed = np.r_[True, np.abs(np.diff(load.current_a)) > STEP_FRACTION * largest_a]
+    largest_a = float(np.abs(capture.current_a).max())
+    step_s = np.clip(np.diff(capture.time_s, append=capture.time_s[-1] + 1.0), 0.0, MAX_ROW_S)
+    changed = np.r_[True, np.abs(np.diff(capture.current_a)) > STEP_FRACTION * largest_a]
     # time since the last change: each sample less the latest changed one
-    since_s = load.time_s - load.time_s[np.maximum.accumulate(np.where(changed, np.arange(changed.size), 0))]
+    since_s = capture.time_s - capture.time_s[np.maximum.accumulate(np.where(changed, np.arange(changed.size), 0))]
     weight = step_s / np.maximum(since_s + step_s, MIN_SINCE_STEP_S)
     weight /= weight.sum()
-    resting = np.abs(load.current_a) < REST_FRACTION * largest_a
-    ends = [end - 1 for first, end in true_runs(resting) if load.time_s[end - 1] - load.time_s[first] > LONG_REST_S]
+    resting = np.abs(capture.current_a) < REST_FRACTION * largest_a
+    ends = [
+        end - 1 for first, end in true_runs(resting) if capture.time_s[end - 1] - capture.time_s[first] > LONG_REST_S
+    ]
     weight[ends] += 1.0 / max(len(ends), 1)
     last = np.zeros(weight.size, dtype=np.bool_)
     last[ends] = True
     return weight, last
 
 
-def _clean_steps(load: CleanCapture) -> NDArray[np.bool_]:
+def _clean_steps(capture: CleanCapture) -> NDArray[np.bool_]:
     """Return a mask of the samples directly after clean current steps (see ``STEADY_FRACTION``)."""
-    largest_a = float(np.abs(load.current_a).max())
-    change_a = np.abs(np.diff(load.current_a, prepend=load.current_a[0]))
-    step_s = np.diff(load.time_s, prepend=load.time_s[0])
+    largest_a = float(np.abs(capture.current_a).max())
+    change_a = np.abs(np.diff(capture.current_a, prepend=capture.current_a[0]))
+    step_s = np.diff(capture.time_s, prepend=capture.time_s[0])
     changes = np.flatnonzero(change_a > STEADY_FRACTION * largest_a)
-    bounds_s = np.r_[load.time_s[0], load.time_s[changes], load.time_s[-1]]
+    bounds_s = np.r_[capture.time_s[0], capture.time_s[changes], capture.time_s[-1]]
     steady = (bounds_s[1:-1] - bounds_s[:-2] >= STEADY_S) & (bounds_s[2:] - bounds_s[1:-1] >= STEADY_S)
     clean = np.zeros(change_a.size, dtype=np.bool_)
     clean[changes[steady]] = True
-    clean &= ~(load.mismatched | np.roll(load.mismatched, 1))
+    clean &= ~(capture.mismatched | np.roll(capture.mismatched, 1))
     return np.asarray(clean & (change_a > STEP_FRACTION * largest_a) & (step_s <= MAX_STEP_S))

@@ -17,34 +17,34 @@ MIN_LOAD_C_RATE = 0.1
 """Minimum C-rate of a load that determines resistances [1/h]."""
 
 
-def load_warning(now: Average, limits: Limits) -> str:
+def load_warning(mean: Average, limits: Limits) -> str:
     """Return a warning about the current of a discharge; empty if the current is suitable."""
-    if now.current_a < -limits.rest_a:
-        return f"The pack is charged at {-now.current_a:.2f} A: disconnect the charger, and connect a load."
-    if now.current_a <= limits.rest_a:
+    if mean.current_a < -limits.rest_a:
+        return f"The pack is charged at {-mean.current_a:.2f} A: disconnect the charger, and connect a load."
+    if mean.current_a <= limits.rest_a:
         return "No current flows: connect the load."
-    if now.current_a < MIN_LOAD_C_RATE * limits.capacity_ah:
-        return f"The load draws only {now.current_a:.2f} A, too little to measure resistances."
+    if mean.current_a < MIN_LOAD_C_RATE * limits.capacity_ah:
+        return f"The load draws only {mean.current_a:.2f} A, too little to measure resistances."
     return ""
 
 
-def limit_warning(now: Average, limits: Limits) -> str:
+def limit_warning(mean: Average, limits: Limits) -> str:
     """Return a warning about a limit of the pack that is exceeded; empty if no limit is."""
-    if now.current_a > limits.max_discharge_a:
-        return f"The load draws {now.current_a:.2f} A, more than {limits.max_discharge_a:.2f} A: reduce it now."
-    if now.temperature_c > limits.max_temperature_c:
-        return f"The pack is at {now.temperature_c:.0f} °C: disconnect charger and load until it is below {limits.max_temperature_c:.0f} °C."
-    if now.current_a < -limits.rest_a and (
-        now.max_cell_v > limits.max_cell_v or now.voltage_v > limits.max_cell_v * limits.series_count
+    if mean.current_a > limits.max_discharge_a:
+        return f"The load draws {mean.current_a:.2f} A, more than {limits.max_discharge_a:.2f} A: reduce it now."
+    if mean.temperature_c > limits.max_temperature_c:
+        return f"The pack is at {mean.temperature_c:.0f} °C: disconnect charger and load until it is below {limits.max_temperature_c:.0f} °C."
+    if mean.current_a < -limits.rest_a and (
+        mean.max_cell_v > limits.max_cell_v or mean.voltage_v > limits.max_cell_v * limits.series_count
     ):
         return "The voltage is above the limit of the cells: end the charge now."
     return ""
 
 
-def empty_warning(now: Average, limits: Limits) -> str:
+def empty_warning(mean: Average, limits: Limits) -> str:
     """Return a warning about a load that discharges an empty pack; empty without one."""
-    if now.current_a > limits.rest_a and now.voltage_v <= limits.cutoff_v:
-        return f"The pack is empty ({now.voltage_v:.2f} V): remove the load now."
+    if mean.current_a > limits.rest_a and mean.voltage_v <= limits.cutoff_v:
+        return f"The pack is empty ({mean.voltage_v:.2f} V): remove the load now."
     return ""
 
 
@@ -60,7 +60,7 @@ MAX_GAP_S = 60.0
 """Maximum time between two means [s]. The charge in a longer gap is unknown."""
 MAX_UNPLANNED_CHARGE = 0.01
 """Maximum charge that may flow in a gap, or against the plan, as a fraction of the capacity."""
-BLOCK_S = 60.0
+RELAY_OPEN_S = 60.0
 """Time for which a relay disconnects the load after a limit was exceeded [s]."""
 INTERRUPTION_S = 3.0
 """Duration of a current in a rest after which the rest begins again [s]."""
@@ -81,7 +81,7 @@ class OcvPoint:
     """Voltage at the end of a rest.
 
     Attributes:
-        soc: SOC by the charge drawn and the rated capacity, 0..1; it may be below 0.
+        soc: SOC from the charge drawn and the rated capacity, 0..1; it may be below 0.
         voltage_v: Voltage at the terminals [V].
     """
 
@@ -226,97 +226,99 @@ class GuidedTest:
     def _max_unplanned_ah(self) -> float:
         return MAX_UNPLANNED_CHARGE * self._limits.capacity_ah
 
-    def _advance(self, now: Average) -> None:
+    def _advance(self, mean: Average) -> None:
         """Advance the test by a mean; begin again if too much charge may have flowed in a gap before it."""
-        step_s = 0.0 if self.latest is None else now.time_s - self.latest.time_s
+        step_s = 0.0 if self.latest is None else mean.time_s - self.latest.time_s
         last_a = 0.0 if self.latest is None else self.latest.current_a
-        self.latest = now
+        self.latest = mean
         lost_ah = abs(last_a) * step_s / 3600.0 if step_s > MAX_GAP_S else 0.0
         if lost_ah > self._max_unplanned_ah and self.phase is not Phase.CHARGE:
             self._start_again(f"Up to {lost_ah:.2f} Ah flowed while nothing was measured; begin again.")
             return
         self.warning = ""
         if self.phase is not Phase.CHARGE:
-            self._count(now, step_s)
+            self._count(mean, step_s)
         if self.phase is Phase.CHARGE:
-            self._advance_charge(now, step_s)
+            self._advance_charge(mean, step_s)
         elif self.phase is Phase.DISCHARGE:
-            self._advance_discharge(now, step_s)
+            self._advance_discharge(mean, step_s)
         elif self.phase is not Phase.DONE:
-            self._advance_rest(now, step_s)
-        if warning := limit_warning(now, self._limits):
-            self.warning, self._blocked_until_s = warning, now.time_s + BLOCK_S
+            self._advance_rest(mean, step_s)
+        if warning := limit_warning(mean, self._limits):
+            self.warning, self._blocked_until_s = warning, mean.time_s + RELAY_OPEN_S
         elif self.phase is not Phase.DISCHARGE:  # a discharge ends by itself at the cut-off
-            self.warning = empty_warning(now, self._limits) or self.warning
+            self.warning = empty_warning(mean, self._limits) or self.warning
 
-    def _count(self, now: Average, step_s: float) -> None:
+    def _count(self, mean: Average, step_s: float) -> None:
         """Count the charge drawn since the pack was full. Begin again if the pack is charged, or discharged too early."""
-        self.drawn_ah += now.current_a * step_s / 3600.0
+        self.drawn_ah += mean.current_a * step_s / 3600.0
         if self.phase in (Phase.DISCHARGE, Phase.REST):
-            self._returned_ah += max(-now.current_a - self._limits.rest_a, 0.0) * step_s / 3600.0
+            self._returned_ah += max(-mean.current_a - self._limits.rest_a, 0.0) * step_s / 3600.0
         if self._returned_ah > self._max_unplanned_ah:
             self._start_again("The pack was charged during the test; begin again.")
         elif self.phase is Phase.FULL_REST and self.drawn_ah > self._max_unplanned_ah:
             self._start_again("The pack was discharged before the rest of the full pack ended; begin again.")
 
-    def _advance_charge(self, now: Average, step_s: float) -> None:
+    def _advance_charge(self, mean: Average, step_s: float) -> None:
         """Wait until the pack is full."""
         cells, full_v = self._limits.series_count, self._limits.full_v
-        if now.current_a < -self._limits.rest_a:
+        if mean.current_a < -self._limits.rest_a:
             self._was_charged = True
-        self._reached_full |= self._was_charged and now.voltage_v >= full_v - FULL_MARGIN_V * cells
-        if self._reached_full and abs(now.current_a) <= max(self._limits.tail_a, self._limits.rest_a):
-            self._enter(Phase.FULL_REST, now)
+        self._reached_full |= self._was_charged and mean.voltage_v >= full_v - FULL_MARGIN_V * cells
+        if self._reached_full and abs(mean.current_a) <= max(self._limits.tail_a, self._limits.rest_a):
+            self._enter(Phase.FULL_REST, mean)
             return
-        is_resting = abs(now.current_a) <= self._limits.rest_a
+        is_resting = abs(mean.current_a) <= self._limits.rest_a
         self._idle_s = self._idle_s + step_s if is_resting else 0.0
         if self._idle_s >= CONFIRM_S:
-            if now.voltage_v >= full_v - RESTED_FULL_MARGIN_V * cells:
-                self._enter(Phase.FULL_REST, now)
+            if mean.voltage_v >= full_v - RESTED_FULL_MARGIN_V * cells:
+                self._enter(Phase.FULL_REST, mean)
             elif self._was_charged:
                 self.warning = (
-                    f"The charge ended at {now.voltage_v:.2f} V, below {full_v:.2f} V: charge further, or set "
+                    f"The charge ended at {mean.voltage_v:.2f} V, below {full_v:.2f} V: charge further, or set "
                     "pack.full_voltage_v to the voltage at which your charger ends."
                 )
-        elif now.current_a > self._limits.rest_a:
-            self.warning = f"The pack is discharged at {now.current_a:.2f} A: remove the load, and connect the charger."
+        elif mean.current_a > self._limits.rest_a:
+            self.warning = (
+                f"The pack is discharged at {mean.current_a:.2f} A: remove the load, and connect the charger."
+            )
 
-    def _advance_rest(self, now: Average, step_s: float) -> None:
+    def _advance_rest(self, mean: Average, step_s: float) -> None:
         """Wait until the rest is over. A current begins the rest again."""
-        if abs(now.current_a) > self._limits.rest_a:
+        if abs(mean.current_a) > self._limits.rest_a:
             self._interrupted_s += step_s
-            verb = "discharged" if now.current_a > 0.0 else "charged"
-            self.warning = f"The pack is {verb} at {abs(now.current_a):.2f} A: disconnect it; the rest begins again."
+            verb = "discharged" if mean.current_a > 0.0 else "charged"
+            self.warning = f"The pack is {verb} at {abs(mean.current_a):.2f} A: disconnect it; the rest begins again."
             if self._interrupted_s > INTERRUPTION_S:
                 self._rested_s = 0.0
-                if self.phase is Phase.FULL_REST and now.current_a < 0.0:  # a full pack that is charged stays full
-                    self.begin_s, self.drawn_ah = now.time_s, 0.0
+                if self.phase is Phase.FULL_REST and mean.current_a < 0.0:  # a full pack that is charged stays full
+                    self.begin_s, self.drawn_ah = mean.time_s, 0.0
             return
         self._interrupted_s = 0.0
         self._rested_s += step_s
         if self._remaining_rest_s > 0.0:
             return
-        self.points.append(OcvPoint(1.0 - self.drawn_ah / self._limits.capacity_ah, now.voltage_v))
-        self._enter(Phase.DONE if self._is_empty else Phase.DISCHARGE, now)
+        self.points.append(OcvPoint(1.0 - self.drawn_ah / self._limits.capacity_ah, mean.voltage_v))
+        self._enter(Phase.DONE if self._is_empty else Phase.DISCHARGE, mean)
 
-    def _advance_discharge(self, now: Average, step_s: float) -> None:
+    def _advance_discharge(self, mean: Average, step_s: float) -> None:
         """Wait until the charge of a step is drawn, or the pack is empty."""
-        if now.current_a > self._limits.rest_a:
-            self._step_ah += now.current_a * step_s / 3600.0
-            self._load_ah += now.current_a * step_s / 3600.0
+        if mean.current_a > self._limits.rest_a:
+            self._step_ah += mean.current_a * step_s / 3600.0
+            self._load_ah += mean.current_a * step_s / 3600.0
             self._load_h += step_s / 3600.0
-        self.warning = load_warning(now, self._limits)
-        is_low = now.voltage_v <= self._limits.cutoff_v or now.min_cell_v <= self._limits.min_cell_v
+        self.warning = load_warning(mean, self._limits)
+        is_low = mean.voltage_v <= self._limits.cutoff_v or mean.min_cell_v <= self._limits.min_cell_v
         self._low_means = self._low_means + 1 if is_low else 0
         self._is_empty = self._low_means >= EMPTY_MEANS
         goal_ah = self._plan.discharge_soc(self.discharge_number) * self._limits.capacity_ah
         if self._is_empty or self._step_ah >= goal_ah:
-            self._enter(Phase.REST, now)
+            self._enter(Phase.REST, mean)
 
-    def _enter(self, phase: Phase, now: Average) -> None:
+    def _enter(self, phase: Phase, mean: Average) -> None:
         self.phase = phase
         self._rested_s = self._interrupted_s = self._step_ah = 0.0
         self._low_means = 0
         if phase is Phase.FULL_REST:
-            self.begin_s, self.drawn_ah, self.restart_reason = now.time_s, 0.0, ""
+            self.begin_s, self.drawn_ah, self.restart_reason = mean.time_s, 0.0, ""
         self.discharge_number += phase is Phase.DISCHARGE

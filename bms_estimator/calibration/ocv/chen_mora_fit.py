@@ -78,12 +78,12 @@ def fit_chen_mora(points: Points) -> ChenMoraFit:
     """
     check_points(points)
     upper = np.r_[points.ocv_v.max(), UPPER[1:]]
-    best = min(range(EXPONENTS.size), key=lambda i: _with_exponent(points, float(EXPONENTS[i]), upper)[0])
+    best = min(range(EXPONENTS.size), key=lambda i: _fit_with_exponent(points, float(EXPONENTS[i]), upper)[0])
     low, high = math.log(EXPONENTS[max(best - 1, 0)]), math.log(EXPONENTS[min(best + 1, EXPONENTS.size - 1)])
-    candidates = [_with_exponent(points, float(EXPONENTS[best]), upper)]
+    candidates = [_fit_with_exponent(points, float(EXPONENTS[best]), upper)]
     for _ in range(SEARCH_STEPS):
         left, right = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-        fits = [_with_exponent(points, math.exp(ln_exponent), upper) for ln_exponent in (left, right)]
+        fits = [_fit_with_exponent(points, math.exp(ln_exponent), upper) for ln_exponent in (left, right)]
         low, high = (low, right) if fits[0][0] < fits[1][0] else (left, high)
         candidates += fits
     _, a = min(candidates, key=lambda fit: fit[0])
@@ -91,7 +91,7 @@ def fit_chen_mora(points: Points) -> ChenMoraFit:
     return ChenMoraFit(a=a, std=_standard_errors(a, upper, points.soc, residual_v), residual_v=residual_v)
 
 
-def _with_exponent(points: Points, exponent: float, upper: Floats) -> tuple[float, Floats]:
+def _fit_with_exponent(points: Points, exponent: float, upper: Floats) -> tuple[float, Floats]:
     """Fit (2.10) with a given a17; return the squared residual and a16..a21.
 
     Only a16 and a18 have bounds. The fit tries each of them free and at its bounds, and keeps the best valid solution.

@@ -38,35 +38,35 @@ def linear_interpolation_matrix(soc: Floats, nodes: Floats) -> Floats:
     return np.column_stack([np.interp(soc, nodes, row) for row in np.eye(nodes.size)])
 
 
-def temperature_of(load: CleanCapture, otherwise_c: float = REFERENCE_C) -> Floats:
+def temperature_of(capture: CleanCapture, otherwise_c: float = REFERENCE_C) -> Floats:
     """Return the temperature at each sample, ``otherwise_c`` without a sensor [C]."""
-    measured = np.isfinite(load.temperature_c)
-    return load.temperature_c if measured.all() else np.where(measured, load.temperature_c, otherwise_c)
+    measured = np.isfinite(capture.temperature_c)
+    return capture.temperature_c if measured.all() else np.where(measured, capture.temperature_c, otherwise_c)
 
 
-def overpotential(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
+def overpotential(cell: CellModel, capture: CleanCapture, soc: Floats) -> Floats:
     """Return the drop of the voltage below the open-circuit voltage E_o(SOC) at 25 C, with dE/dT and hysteresis [V].
 
     Args:
         cell: Cell with an RC ladder, or with a1..a15, which do not depend on the temperature.
-        load: Capture that starts at rest.
+        capture: Capture that starts at rest.
         soc: Shape (n,), SOC by coulomb counting.
     """
-    temperature_c = temperature_of(load)
+    temperature_c = temperature_of(capture)
     if cell.ladder is None:
-        drop_v = two_branches(load.time_s, load.current_a, soc, cell.a[:16])
+        drop_v = two_branches(capture.time_s, capture.current_a, soc, cell.a[:16])
     else:
-        drop_v = ladder_overpotential(cell.ladder, load, soc, temperature_c)
-    return drop_v - ocv_offset(cell, load, soc)
+        drop_v = ladder_overpotential(cell.ladder, capture, soc, temperature_c)
+    return drop_v - ocv_offset(cell, capture, soc)
 
 
-def ocv_offset(cell: CellModel, load: CleanCapture, soc: Floats) -> Floats:
+def ocv_offset(cell: CellModel, capture: CleanCapture, soc: Floats) -> Floats:
     """Return the change of E_o(SOC) by temperature and hysteresis [V]. The hysteresis starts as that after a charge."""
-    ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(load)
+    ocv, added_v, temperature_c = cell.ocv, np.zeros(soc.size), temperature_of(capture)
     if not isinstance(ocv, TableOcv):
         return added_v
     if ocv.hysteresis_v is not None:
-        added_v += hysteresis(load.time_s, soc, Noise().hysteresis_soc, 1.0)
+        added_v += hysteresis(capture.time_s, soc, Noise().hysteresis_soc, 1.0)
     for begin in range(0, soc.size, BLOCK_SAMPLES):
         block = slice(begin, begin + BLOCK_SAMPLES)
         if ocv.hysteresis_v is not None:
@@ -99,15 +99,17 @@ def steady_drop(ladder: Ladder, current_a: float, soc: Floats, temperature_c: Fl
     return np.asarray(current_a * ohm)
 
 
-def ladder_overpotential(ladder: Ladder, load: CleanCapture, soc: Floats, temperature_c: Floats) -> Floats:
+def ladder_overpotential(ladder: Ladder, capture: CleanCapture, soc: Floats, temperature_c: Floats) -> Floats:
     """Return the overpotential of the ladder, with its ohmic drop [V]."""
     drop_v = np.empty(soc.size)
     last_a = np.zeros(BRANCHES)
     for begin in range(0, soc.size, BLOCK_SAMPLES):
         block, first = slice(begin, begin + BLOCK_SAMPLES), max(begin - 1, 0)
-        branches_a = branch_currents_from(last_a, load.time_s[first : block.stop], load.current_a[first : block.stop])
+        branches_a = branch_currents_from(
+            last_a, capture.time_s[first : block.stop], capture.current_a[first : block.stop]
+        )
         last_a = branches_a[-1]
-        currents = np.column_stack([load.current_a[block], branches_a[begin - first :]])
+        currents = np.column_stack([capture.current_a[block], branches_a[begin - first :]])
         node_weights = linear_interpolation_matrix(soc[block], np.array(ladder.soc))
         weak_v = ((node_weights @ np.array(ladder.weak_ohm).T) * currents).sum(axis=1)
         strong_v = ((node_weights @ np.array(ladder.strong_ohm).T) * currents).sum(axis=1)

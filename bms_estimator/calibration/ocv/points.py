@@ -106,7 +106,7 @@ def coldness(temperature_c: Floats) -> Floats:
     return np.asarray(2.0 ** (colder / DOUBLING_K) - 1.0, dtype=np.float64)
 
 
-def joined(sources: Sequence[Points]) -> Points:
+def join_points(sources: Sequence[Points]) -> Points:
     """Return the points of several sources in the order of SOC, with the index of each point's source."""
     soc = np.concatenate([source.soc for source in sources])
     order = np.argsort(soc, kind="stable")
@@ -128,9 +128,9 @@ def joined(sources: Sequence[Points]) -> Points:
     )
 
 
-def pooled(tests: Sequence[RelaxationTest]) -> Points:
+def pool_tests(tests: Sequence[RelaxationTest]) -> Points:
     """Return the points of several tests in the order of SOC."""
-    return joined([points_of(test) for test in tests])
+    return join_points([points_of(test) for test in tests])
 
 
 def with_ends(points: Points, empty_std_v: float, full_std_v: float) -> Points:

@@ -28,9 +28,9 @@ MIN_REST_S = 30.0
 MAX_STD_V = 0.02
 """Maximum standard deviation of an extrapolated voltage, per cell in series [V]."""
 FIT_FROM = 0.5
-"""Fraction of a rest's duration from which on the exponential is fitted. The fast RC pair has decayed by then."""
+"""Fraction of a rest's duration after which the exponential is fitted. The fast RC pair has decayed by then."""
 END_FROM = 0.98
-"""Fraction of a rest's duration from which on the voltages are averaged; the mean is the voltage at the rest's end."""
+"""Fraction of a rest's duration after which the voltages are averaged; the mean is the voltage at the rest's end."""
 MIN_TAU = 0.05
 """Minimum candidate time constant, as a fraction of the rest's duration."""
 MAX_TAU = 0.7
@@ -262,7 +262,7 @@ def _extrapolated_rest(rest: SampleBlock, soc: float, *, after_charge: bool) -> 
     ocv_v, spread_v = _extrapolate(time_s[late], rest["voltage_v"][late], duration_s)
     voltage_v = float(rest["voltage_v"][time_s >= END_FROM * duration_s].mean())
     # a short rest cannot exclude the slow time constant
-    slow_coefficients, _, _ = _with_tau(time_s[late], rest["voltage_v"][late], SLOW_TAU_S)
+    slow_coefficients, _, _ = _fit_with_tau(time_s[late], rest["voltage_v"][late], SLOW_TAU_S)
     slow_std_v = SLOW_TAU_FRACTION * (float(slow_coefficients[0]) - ocv_v) if duration_s < SLOW_TAU_S else 0.0
     return Rest(
         start_s=float(rest["time_s"][0]),
@@ -286,7 +286,7 @@ def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[
     """
     elapsed = time_s - time_s[0]
     taus = np.geomspace(MIN_TAU * duration_s, MAX_TAU * duration_s, TAU_COUNT)
-    fits = [_with_tau(elapsed, voltage_v, tau) for tau in taus]
+    fits = [_fit_with_tau(elapsed, voltage_v, tau) for tau in taus]
     v_inf = np.array([coefficients[0] for coefficients, _, _ in fits])
     residual2 = np.array([s for _, _, s in fits])
     variance = max(float(residual2.min()) / max(elapsed.size - 3, 1), MIN_NOISE_V**2)
@@ -298,7 +298,7 @@ def _extrapolate(time_s: Floats, voltage_v: Floats, duration_s: float) -> tuple[
     return mean_v, spread_v
 
 
-def _with_tau(elapsed: Floats, voltage_v: Floats, tau_s: float) -> tuple[Floats, Floats, float]:
+def _fit_with_tau(elapsed: Floats, voltage_v: Floats, tau_s: float) -> tuple[Floats, Floats, float]:
     """Fit the exponential with time constant ``tau_s``; return coefficients, basis and squared residual."""
     basis = np.column_stack([np.ones_like(elapsed), np.exp(-elapsed / tau_s)])
     coefficients = np.linalg.lstsq(basis, voltage_v, rcond=None)[0]

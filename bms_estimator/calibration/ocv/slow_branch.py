@@ -1,4 +1,4 @@
-"""Recognition of low-rate discharges and charges in captures, and the capacity by a complete discharge."""
+"""Recognition of low-rate discharges and charges in captures, and the capacity from a complete discharge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,8 @@ EMPTY_FALL = 0.01
 """A discharge ends empty if the voltage falls by more than this fraction of its median while the last 1 % of the charge is
 drawn."""
 MAX_BEFORE_FRACTION = 0.01
-"""Maximum net charge drawn before a discharge that measures the capacity, or charged below full, as a fraction of its charge."""
+"""Maximum net charge before a discharge that measures the capacity, as a fraction of its charge. Charging a full cell is
+allowed."""
 
 
 @dataclass(frozen=True)
@@ -146,11 +147,11 @@ def _branch(
 
 
 def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
-    """Return the capacity [Ah] by the low-rate discharge down to empty whose temperature is nearest to 25 degC; NaN without one.
+    """Return the capacity [Ah] from the low-rate discharge to empty that is nearest to 25 °C; NaN without such a discharge.
 
-    Only discharges count that start at a given SOC or with a full cell, because others give a lower bound at most.
+    Only discharges that start at a given SOC or with a full cell count. Others give a lower bound at most.
     """
-    known = [
+    complete = [
         branch
         for branch in branches
         if branch.to_empty
@@ -160,7 +161,7 @@ def measured_capacity_ah(branches: Sequence[SlowBranch]) -> float:
         and (abs(branch.before_ah) if branch.start.soc < 1.0 else branch.before_ah)
         < MAX_BEFORE_FRACTION * branch.ah[-1]
     ]
-    if not known:
+    if not complete:
         return float("nan")
-    nearest = min(known, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0))
+    nearest = min(complete, key=lambda branch: abs(np.nan_to_num(branch.temperature_c, nan=25.0) - 25.0))
     return float(nearest.ah[-1]) / nearest.start.soc

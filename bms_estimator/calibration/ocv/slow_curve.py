@@ -56,7 +56,7 @@ UNPAIRED_OHMIC_FRACTION = 0.5
 """Ohmic part of the systematic error of an unpaired curve, as a fraction of the ohmic drop, which is measured only at the full
 end and subtracted at every SOC."""
 PAIR_COLD_FRACTION = 0.25
-"""Fraction of the error ``COLD_V``, by which a cold cell relaxes too slowly, that remains in the mean of charge and discharge.
+"""Fraction of ``COLD_V``, the error due to slow relaxation in the cold, that remains in the mean of charge and discharge.
 An unpaired curve has all of this error."""
 
 
@@ -101,7 +101,7 @@ def slow_curves(branches: Sequence[SlowBranch], capacity_ah: float, *, series_co
             )
         charge = next((candidate for candidate in charges if _are_pair(discharge, candidate)), None)
         if charge is None:
-            curves.append(_unpaired(discharge, soc, series_count, ()))
+            curves.append(_unpaired_curve(discharge, soc, series_count, ()))
             continue
         charges.remove(charge)
         charge_soc = soc[-1] + charge.ah / capacity_ah
@@ -110,13 +110,13 @@ def slow_curves(branches: Sequence[SlowBranch], capacity_ah: float, *, series_co
                 f"its charge {charge.name} left out: {charge.ah[-1]:.3f} Ah went in after {discharge.ah[-1]:.3f} Ah had "
                 "come out, so the charge is incomplete or its current is wrong"
             )
-            curves.append(_unpaired(discharge, soc, series_count, (incomplete,)))
+            curves.append(_unpaired_curve(discharge, soc, series_count, (incomplete,)))
             continue
         if charge_soc[-1] > 1.0:  # more went in than the capacity: the charge ends full
             charge_soc = soc[-1] + (1.0 - soc[-1]) * charge.ah / charge.ah[-1]
-        curves.append(_pair(discharge, soc, charge, charge_soc, series_count))
+        curves.append(_paired_curve(discharge, soc, charge, charge_soc, series_count))
     return curves + [
-        _unpaired(charge, 1.0 - (charge.ah[-1] - charge.ah) / capacity_ah, series_count, ("assumed to end full",))
+        _unpaired_curve(charge, 1.0 - (charge.ah[-1] - charge.ah) / capacity_ah, series_count, ("assumed to end full",))
         for charge in charges
     ]
 
@@ -128,7 +128,7 @@ def _are_pair(discharge: SlowBranch, charge: SlowBranch) -> bool:
     return bool(near_temperature) and abs(charge.current_a / discharge.current_a - 1.0) <= PAIR_CURRENT
 
 
-def _pair(
+def _paired_curve(
     discharge: SlowBranch, discharge_soc: Floats, charge: SlowBranch, charge_soc: Floats, series_count: int
 ) -> SlowCurve:
     """Return the mean of a discharge and a charge.
@@ -169,7 +169,7 @@ def _pair(
     )
 
 
-def _unpaired(branch: SlowBranch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
+def _unpaired_curve(branch: SlowBranch, soc: Floats, series_count: int, notes: tuple[str, ...]) -> SlowCurve:
     """Return the curve of an unpaired discharge or charge, without its ohmic drop."""
     grid = GRID[(soc.min() <= GRID) & (soc.max() >= GRID)]
     sign = -1.0 if branch.charge else 1.0

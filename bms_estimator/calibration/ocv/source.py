@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from bms_estimator.calibration.cleaning.start_soc import StartSoc
-from bms_estimator.calibration.ocv.points import Points, joined
+from bms_estimator.calibration.ocv.points import Points, join_points
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.calibration.ocv.slow_branch import SlowBranch
 from bms_estimator.model.arrays import Floats
@@ -12,13 +12,13 @@ from bms_estimator.model.sample import SampleBlock
 
 @dataclass(frozen=True)
 class Recording:
-    """Capture.
+    """Capture with the SOC at its start.
 
     Attributes:
         name: Name for messages.
         samples: Raw samples, dtype ``SAMPLE``.
-        start: SOC at the first sample; None: full for the captures that start at the highest voltage, otherwise by the OCV curve
-            of the other sources.
+        start: SOC at the first sample; None: full for the captures that start at the highest voltage, otherwise from the OCV
+            curve of the other sources.
     """
 
     name: str
@@ -75,13 +75,13 @@ class OcvSources:
 
     Attributes:
         capacity_ah: Given capacity, otherwise ``measured_ah`` [Ah].
-        measured_ah: Capacity by a full low-rate discharge [Ah]; NaN without one.
+        measured_ah: Capacity from a full low-rate discharge [Ah]; NaN without such a discharge.
         sources: Low-rate curves, given curves, and rests.
         tests: Relaxation tests among ``sources``.
         hysteresis_v: Hysteresis of a rested cell at ``NODES`` and 25 C [V], from the source nearest to 25 C that shows
             hysteresis; None without such a source.
         hysteresis_std_v: Standard deviation of ``hysteresis_v`` [V].
-        usual_hysteresis: True if ``hysteresis_v`` comes from typical cells (``center_on_typical_hysteresis``).
+        has_typical_hysteresis: True if ``hysteresis_v`` comes from typical cells (``center_on_typical_hysteresis``).
     """
 
     capacity_ah: float
@@ -90,9 +90,9 @@ class OcvSources:
     tests: tuple[RelaxationTest, ...]
     hysteresis_v: Floats | None
     hysteresis_std_v: Floats
-    usual_hysteresis: bool = False
+    has_typical_hysteresis: bool = False
 
     @property
     def points(self) -> Points:
         """Points of all sources."""
-        return joined([source.points for source in self.sources])
+        return join_points([source.points for source in self.sources])

@@ -8,16 +8,16 @@ import numpy as np
 from bms_estimator.calibration.cleaning.rests import remove_glitches
 from bms_estimator.calibration.cleaning.start_soc import SAME_START_V, StartSoc
 from bms_estimator.calibration.ocv.hysteresis import (
-    REST_SHARE_STD,
-    centered,
+    RESTED_FRACTION_STD,
+    center_points,
     find_hysteresis_source,
     has_plateau,
     hysteresis_factor,
-    measured_share,
-    typical_share,
+    measured_rested_fraction,
+    typical_rested_fraction,
 )
 from bms_estimator.calibration.ocv.overpotential import steady_drop
-from bms_estimator.calibration.ocv.points import Points, joined, points_of
+from bms_estimator.calibration.ocv.points import Points, join_points, points_of
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v, relaxation_test
 from bms_estimator.calibration.ocv.slow_branch import SlowBranch, measured_capacity_ah, slow_branches
 from bms_estimator.calibration.ocv.slow_curve import GRID, SlowCurve, slow_curves
@@ -32,9 +32,9 @@ GIVEN_V = 1e-3
 GIVEN_SYSTEMATIC_V = 2e-3
 """Std of the systematic error of a given curve, per cell [V]."""
 PLATEAU_SYSTEMATIC_V = 0.01
-"""Std of the systematic error of a given curve with a plateau, per cell [V]. Such a curve is mostly a quasi-OCV: the mean of a slow
-charge and a slow discharge, or one of both. On the plateau it deviates from the rested OCV by part of the hysteresis and of the
-overpotential, and a millivolt is 1 % of SOC."""
+"""Std of the systematic error of a given curve with a plateau, per cell [V]. Such a curve is mostly a quasi-OCV: the mean of a
+slow charge and a slow discharge, or one of both. On the plateau it deviates from the rested OCV by part of the hysteresis and
+of the overpotential, and a millivolt is 1 % of SOC."""
 MAX_CAPACITY_DIFFERENCE = 0.05
 """Relative difference between the given and the measured capacity above which a source has a remark."""
 
@@ -52,7 +52,7 @@ def find_sources(
     Args:
         recordings: Captures.
         curves: Given curves.
-        capacity_ah: Capacity that the SOC of rests is counted against [Ah]; None: the capacity by a full low-rate
+        capacity_ah: Capacity that the SOC of rests is counted against [Ah]; None: the capacity from a full low-rate
             discharge. The SOC of low-rate curves is counted against the measured capacity if there is one.
         initial_soc: SOC at the first sample, 0..1, of the captures without a ``start`` that start at the highest voltage.
         series_count: Cells in series.
@@ -79,26 +79,31 @@ def find_sources(
         _given_curve_source(curve, series_count) for curve in curves
     ]
     rests = [recording for recording in recordings if not branches[recording.name]]
-    tests_with_points = _rests(rests, sources, all_branches, used_ah, initial_soc, series_count)
+    tests_with_points = _tests_with_points(rests, sources, all_branches, used_ah, initial_soc, series_count)
     hysteresis_source = find_hysteresis_source(sources)
     hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
     if hysteresis_source is not None and hysteresis_source.hysteresis_v is not None:
-        share = measured_share(hysteresis_source, tests_with_points)
+        rested_fraction = measured_rested_fraction(hysteresis_source, tests_with_points)
         half_difference_v = hysteresis_source.hysteresis_v / hysteresis_factor(hysteresis_source.temperature_c)
         hysteresis_at_rest_v = half_difference_v * (
-            typical_share(hysteresis_source, series_count) if share is None else share
+            typical_rested_fraction(hysteresis_source, series_count) if rested_fraction is None else rested_fraction
         )
         # the hysteresis of a given curve is used unchanged, unless rests measure its fraction
-        is_unchanged = hysteresis_source in sources[len(slow) :] and share is None
+        is_unchanged = hysteresis_source in sources[len(slow) :] and rested_fraction is None
         hysteresis_v = np.interp(NODES, GRID, half_difference_v if is_unchanged else hysteresis_at_rest_v)
-        hysteresis_std_v = REST_SHARE_STD * np.interp(NODES, GRID, half_difference_v)
+        hysteresis_std_v = RESTED_FRACTION_STD * np.interp(NODES, GRID, half_difference_v)
         tests_with_points = [
-            (test, centered(points, hysteresis_at_rest_v * hysteresis_factor(test.temperature_c), REST_SHARE_STD))
+            (
+                test,
+                center_points(
+                    points, hysteresis_at_rest_v * hysteresis_factor(test.temperature_c), RESTED_FRACTION_STD
+                ),
+            )
             for test, points in tests_with_points
         ]
-        if share is not None:
+        if rested_fraction is not None:
             sources = [
-                replace(source, notes=(*source.notes, f"rests keep {share:.2f} of its hysteresis"))
+                replace(source, notes=(*source.notes, f"rests keep {rested_fraction:.2f} of its hysteresis"))
                 if source is hysteresis_source
                 else source
                 for source in sources
@@ -145,7 +150,7 @@ def _given_curve_source(curve: ExternalCurve, series_count: int) -> Source:
     return Source(curve.name, f"given curve, {curve.soc.size} points", points, float("nan"), hysteresis_v, ())
 
 
-def _rests(
+def _tests_with_points(
     recordings: Sequence[Recording],
     sources: Sequence[Source],
     branches: Sequence[SlowBranch],
@@ -155,8 +160,8 @@ def _rests(
 ) -> list[tuple[RelaxationTest, Points]]:
     """Return the relaxation tests and their points.
 
-    A capture whose initial SOC is not known gets it from the curve of the others: a capture that starts at a lower voltage, or
-    whose SOC was read from another cell's curve.
+    The initial SOC of a capture is read from the curve of the others if the capture starts at a lower voltage, or if its SOC was
+    read from another cell's curve.
     """
     start_volts = [initial_rest_v(recording.samples, recording.name, capacity_ah) for recording in recordings]
     highest_v = np.nanmax([*start_volts, *(branch.start_v for branch in branches if not branch.charge), -np.inf])
@@ -164,9 +169,7 @@ def _rests(
         _known_soc(recording, None if start_v < highest_v - SAME_START_V * series_count else initial_soc)
         for recording, start_v in zip(recordings, start_volts, strict=True)
     ]
-    if not sources and all(
-        start is None for start in starts
-    ):  # without a curve, the SOCs by the other cell's curve remain
+    if not sources and all(start is None for start in starts):  # without a curve, another cell's curve gives the SOCs
         starts = [recording.start.soc if recording.start else initial_soc for recording in recordings]
 
     def evaluate(recording: Recording, soc: float) -> tuple[RelaxationTest, Points]:
@@ -182,7 +185,7 @@ def _rests(
     }
     if None in starts:
         curve = fit_table(
-            joined([*(source.points for source in sources), *(points for _, points in tests_with_points.values())])
+            join_points([*(source.points for source in sources), *(points for _, points in tests_with_points.values())])
         )
         for recording, start_v, soc in zip(recordings, start_volts, starts, strict=True):
             if soc is None:

@@ -169,7 +169,7 @@ def fit_table(points: Points) -> TableFit:
         slope_v = np.clip(_spline(points.soc, 1) @ coefficients[: model.splines], 0.0, MAX_SLOPE_V * voltage_scale)
         middle_slope_v = _spline(middles, 1) @ coefficients[: model.splines]
         scatter_factor, systematic_factor = _error_factors(points, model, coefficients, systematic_factor)
-    basis, entropy = _spline(NODES), linear_interpolation_matrix(NODES, ENTROPY_NODES)
+    basis, entropy_basis = _spline(NODES), linear_interpolation_matrix(NODES, ENTROPY_NODES)
     rows = np.vstack([model.points / std_v[:, None], model.prior])
     covariance = np.linalg.pinv(rows.T @ rows, hermitian=True)[: model.splines, : model.splines]
     per_kelvin_at_nodes_v = coefficients[model.splines : model.splines + ENTROPY_NODES.size]
@@ -180,7 +180,7 @@ def fit_table(points: Points) -> TableFit:
         soc=NODES,
         ocv_v=ocv_v,
         error_v=np.sqrt(np.einsum("ij,jk,ik->i", basis, covariance, basis)),
-        per_kelvin_v=entropy @ per_kelvin_at_nodes_v if model.temperature_columns else None,
+        per_kelvin_v=entropy_basis @ per_kelvin_at_nodes_v if model.temperature_columns else None,
         residual_v=measured.ocv_v - interpolate(measured.soc),
         deviation_v=_deviations(points, model, coefficients),
     )
@@ -199,11 +199,11 @@ def _model(
         voltage_scale: Voltage of the cell relative to ``CELL_V``.
     """
     spline = _spline(points.soc)
-    warmer = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
+    above_25_c = np.where(np.isfinite(points.temperature_c), points.temperature_c - REFERENCE_C, 0.0)
     columns, stds = [spline], [np.zeros(0)]
-    if np.ptp(warmer) >= MIN_SPAN_K:
+    if np.ptp(above_25_c) >= MIN_SPAN_K:
         by_soc = linear_interpolation_matrix(points.soc, ENTROPY_NODES)
-        columns += [warmer[:, None] * by_soc, points.cold_v[:, None] * by_soc]
+        columns += [above_25_c[:, None] * by_soc, points.cold_v[:, None] * by_soc]
         stds += [np.full(ENTROPY_NODES.size, ENTROPY_V_PER_K * voltage_scale), np.ones(ENTROPY_NODES.size)]
     temperature_columns = sum(column_stds.size for column_stds in stds)
     for source in range(int(points.source.max()) + 1):

@@ -179,11 +179,11 @@ def adapt(captures: Sequence[Columns], cell: CellModel, *, soc: float | None = N
         UserError: A capture contradicts the cell, a1..a15 cannot be estimated, or the replays get worse.
     """
     cleaned = [clean_capture(capture.name, capture.rows, cell) for capture in captures]
-    socs = [initial_soc(load, cell) if soc is None else soc for load in cleaned]
+    socs = [initial_soc(clean, cell) if soc is None else soc for clean in cleaned]
     contradictions = [
         line
-        for load, start_soc in zip(cleaned, socs, strict=True)
-        for line in capture_contradictions(load, cell, start_soc)
+        for clean, start_soc in zip(cleaned, socs, strict=True)
+        for line in capture_contradictions(clean, cell, start_soc)
     ]
     if contradictions:
         raise UserError("\n".join(contradictions))
@@ -243,17 +243,17 @@ def _scored_capture(
     cell: CellModel, adapted: CellModel, cleaned: list[CleanCapture], captures_with_soc: list[CaptureWithSoc], j: int
 ) -> AdaptedCapture:
     """Return the errors and scores of capture ``j``. If there are other captures, the cell is adapted only to these."""
-    load, capture = cleaned[j], captures_with_soc[j]
+    clean, capture = cleaned[j], captures_with_soc[j]
     others = [s for k, s in enumerate(captures_with_soc) if k != j]
     adapted_to_others = _adapted_cell(cell, others)[1] if others else adapted
-    soc_of_samples = capture.soc - load.discharged_ah / cell.cell.capacity_ah
+    soc_of_samples = capture.soc - clean.discharged_ah / cell.cell.capacity_ah
     error_v = predict(adapted, capture.samples, capture.soc, lowest_soc=LOWEST_SOC).error_v
     return AdaptedCapture(
-        name=load.name,
+        name=clean.name,
         initial_soc=capture.soc,
         voltage_rms_v=float(np.sqrt(np.mean(error_v**2))),
-        score_before=interval_score(cell, load, soc_of_samples),
-        score_after=interval_score(adapted_to_others, load, soc_of_samples),
+        score_before=interval_score(cell, clean, soc_of_samples),
+        score_after=interval_score(adapted_to_others, clean, soc_of_samples),
         held_back=bool(others),
     )
 
@@ -266,7 +266,7 @@ def _temperatures(captures_with_soc: Sequence[CaptureWithSoc]) -> tuple[float, f
 
 
 def _geometric_mean(scores: Sequence[float]) -> float:
-    """Return the geometric mean of the finite scores; NaN without any."""
+    """Return the geometric mean of the finite scores; NaN if there are none."""
     finite = [score for score in scores if np.isfinite(score)]
     return float(np.exp(np.mean(np.log(finite)))) if finite else float("nan")
 

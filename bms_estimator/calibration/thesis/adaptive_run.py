@@ -1,8 +1,9 @@
 """Step 2 of the thesis: run of the adaptive observer over a capture, and the average of its parameters.
 
-Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md. a1..a15 are the coefficients of the elements of Chen and Mora's model as functions of SOC. The observer runs over the
-whole capture by Algorithm 1 or one of schemes 1 to 3. It stops adapting at the SOC below which a capacitance of the model is
-negative (Fig. 19). The result contains "converged" or the reason for a failure.
+Numbers in parentheses are equations of the thesis. Errata are listed in docs/theory/thesis.md. a1..a15 are the coefficients of
+the elements of Chen and Mora's model as functions of SOC. The observer runs over the whole capture by Algorithm 1 or one of
+schemes 1 to 3. It stops adapting at the SOC below which a capacitance of the model is negative (Fig. 19). The result contains
+"converged" or the reason for a failure.
 
 The average (3.19) begins at the time t_int, when the error has settled, and ends at the time t_unst, when the model becomes
 unstable. Both times are determined from the run. delta1 (2.11) and delta2 (2.12) are the SOCs below which C_ts and C_tl
@@ -21,7 +22,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
 
-SETTLED_SHARE = 0.99
+SETTLED_FRACTION = 0.99
 """Minimum fraction of the samples after t_int whose error is within its bound."""
 SETTLED_PARAMETER = 1e-3
 """Maximum relative deviation of a settled parameter from its median."""
@@ -87,12 +88,11 @@ def averaging_window(
     inside = time_s <= end_s
     large = np.abs(error_v[inside]) > epsilon_v
     remaining = np.arange(large.size, 0, -1)
-    large_fraction = (
-        np.cumsum(large[::-1])[::-1] / remaining
-    )  # fraction of large errors in each sample and its successors
-    settled = (large_fraction <= 1.0 - SETTLED_SHARE) & ~large
+    # fraction of large errors in each sample and its successors
+    large_fraction = np.cumsum(large[::-1])[::-1] / remaining
+    settled = (large_fraction <= 1.0 - SETTLED_FRACTION) & ~large
     if not settled.any():
-        # the window contains only its last sample, and ``averaged`` returns the values of that sample
+        # the window contains only its last sample, and ``average_parameters`` returns the values of that sample
         reason = f"the error never settles within {1e3 * epsilon_v:.2f} mV"
         return AveragingWindow(float(time_s[inside][-1]), end_s, reason, end_reason)
     error_from = int(np.argmax(settled))
@@ -111,7 +111,7 @@ def _check_inside(name: str, given_s: float, first_s: float, last_s: float) -> N
 
 
 def _settled_from(a: Floats) -> int:
-    """Return the index from which on every parameter stays near its median over the second half."""
+    """Return the index after which every parameter stays near its median over the second half."""
     median = np.median(a[a.shape[0] // 2 :], axis=0)
     unsettled = np.flatnonzero((np.abs(a - median) > SETTLED_PARAMETER * np.abs(median)).any(axis=1))
     return min(int(unsettled[-1]) + 1, a.shape[0] - 1) if unsettled.size else 0
@@ -129,7 +129,7 @@ def _unstable_from(time_s: Floats, voltage_v: Floats, margin: Floats) -> tuple[f
 
 
 def _knee(time_s: Floats, voltage_v: Floats) -> float | None:
-    """Return the time at which the last fall of the voltage begins [s]; None without one."""
+    """Return the time at which the last fall of the voltage begins [s]; None without a fall."""
     edges = np.linspace(0, time_s.size - 1, SLOPE_WINDOWS + 1).astype(int)
     if np.unique(edges).size < edges.size:  # fewer samples than windows
         return None
@@ -143,7 +143,7 @@ def _knee(time_s: Floats, voltage_v: Floats) -> float | None:
     return float(time_s[edges[first]])
 
 
-def averaged(time_s: Floats, a: Floats, window: AveragingWindow) -> Floats:
+def average_parameters(time_s: Floats, a: Floats, window: AveragingWindow) -> Floats:
     """Return the mean of a_i(t) over t_int..t_unst, (3.19).
 
     Args:
@@ -166,7 +166,7 @@ SNAPSHOTS = 3000
 """Maximum number of equidistant snapshots of a_i(t) over a run, in addition to ``FIRST_SAMPLES``."""
 FIRST_SAMPLES = 200
 """Number of first samples that are all recorded, because a_i(t) moves from its initial value to its limit there."""
-CONVERGED_SHARE = 0.95
+CONVERGED_FRACTION = 0.95
 """Minimum fraction of the samples between t_int and t_unst whose error is within eps2."""
 
 SNAPSHOT_FIELDS = (
@@ -307,7 +307,7 @@ def adaptive_run(
         gain=recorded["nussbaum_gain"],
         a=parameters,
         window=window,
-        average=averaged(recorded["time_s"], parameters, window),
+        average=average_parameters(recorded["time_s"], parameters, window),
         crossings=(
             _crossing("a8", parameters[-1], recorded["soc"], recorded["time_s"]),
             _crossing("a11", parameters[-1], recorded["soc"], recorded["time_s"]),
@@ -332,9 +332,9 @@ def _outcome(window: AveragingWindow, time_s: Floats, error_v: Floats, epsilon_v
     if inside.sum() < 2:
         worst = float(np.abs(error_v[time_s <= window.t_unst_s]).max(initial=0.0))
         return f"not converged: {window.start_reason}; largest |e| {1e3 * worst:.2f} mV until {window.t_unst_s:.0f} s"
-    share = float((np.abs(error_v[inside]) <= epsilon_v).mean())
-    if share < CONVERGED_SHARE:
-        return f"not converged: |e| is within {1e3 * epsilon_v:.2f} mV for {100 * share:.1f} % of the samples only"
+    fraction = float((np.abs(error_v[inside]) <= epsilon_v).mean())
+    if fraction < CONVERGED_FRACTION:
+        return f"not converged: |e| is within {1e3 * epsilon_v:.2f} mV for {100 * fraction:.1f} % of the samples only"
     if lock_losses:
         return f"not converged: lock was lost {lock_losses} times"
     return "converged"

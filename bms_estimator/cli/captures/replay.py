@@ -41,7 +41,7 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.pack.pack import Pack, Step, new_pack
+from bms_estimator.pack.pack import Pack, RunResult, new_pack
 from bms_estimator.service.kernel_warm_up import load_forecast_kernels
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.service.service_status import ServiceStatus
@@ -223,7 +223,7 @@ class _TableRows:
                 received.samples[part], received.cells_v[part], received.probes[part], received.device_soc[part]
             )
 
-    def add(self, step: Step) -> None:
+    def add(self, step: RunResult) -> None:
         """Append the rows of a part."""
         if self._table is None:
             return

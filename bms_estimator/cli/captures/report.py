@@ -39,7 +39,7 @@ from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.pack_model.aging_course import aging_course
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.saved import history_of
+from bms_estimator.pack_model.saved import history_from_arrays
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.reports.aging_group import AgingHistory
 from bms_estimator.reports.capture_report import capture_report
@@ -113,7 +113,7 @@ def _aging_history(files: StateFiles, settings: Settings, model: CellModel) -> A
     file = files.history
     try:
         arrays = file.load()
-        rows, fit = history_of(arrays) if arrays else (None, None)
+        rows, fit = history_from_arrays(arrays) if arrays else (None, None)
         if rows is None or fit is None:
             return AgingHistory(
                 None,

@@ -29,7 +29,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign
 from bms_estimator.reports.thesis import report_items
-from bms_estimator.reports.thesis.experiment import Recorded
+from bms_estimator.reports.thesis.experiment import RecordedCaptures
 from bms_estimator.reports.thesis.report import LONG_CELL, Report, build, write
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 
@@ -95,13 +95,13 @@ def _load_recorded(
     resolution_v: float,
     current_sign: CurrentSign | None,
     column_map: ColumnMap | None,
-) -> Recorded:
+) -> RecordedCaptures:
     if cell is None:
         raise UserError("captures require --cell NAME|CELL.toml, which gives capacity, limits and bounds of the cell")
     reject_duplicates(captures)
     loaded = load_captures(captures, current_sign=current_sign, column_map=column_map)
     named_rows = tuple((name_of(path), capture.rows) for path, capture in zip(captures, loaded, strict=True))
-    return Recorded(load_cell(cell, capacity_ah), named_rows, resolution_v)
+    return RecordedCaptures(load_cell(cell, capacity_ah), named_rows, resolution_v)
 
 
 def _print_items(console: Console, report: Report) -> None:

@@ -110,7 +110,7 @@ def _origin_lines(calibration: Calibration) -> list[str]:
         ocv = "from the given cell, corrected by the fit"
     else:
         ocv = "measured" if calibration.is_ocv_measured else "estimated from rests of less than 2 minutes"
-    if model.ocv is not None and model.ocv.sources.usual_hysteresis:
+    if model.ocv is not None and model.ocv.sources.has_typical_hysteresis:
         ocv += f", with the hysteresis of the generic {model.ocv.generic.cell.name}"
     if model.identification is not None:
         return [f"OCV: {ocv}.", "Resistances: identified."]

@@ -174,7 +174,7 @@ def _result(form: OcvForm, determined: OcvCell) -> OcvResult:
         capacity_ah=ocv_sources.capacity_ah,
         capacity_measured_ah=finite(ocv_sources.measured_ah),
         generic=generic.cell.name,
-        usual_hysteresis=ocv_sources.usual_hysteresis,
+        usual_hysteresis=ocv_sources.has_typical_hysteresis,
         series_count=generic.cell.series_count,
         points=points.soc.size,
         soc=points.soc.tolist(),

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from bms_estimator.fleet.packs.pack_type import Digest
 from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.fit import PackFit
-from bms_estimator.pack_model.saved import Arrays, curve_arrays, fit_of_curves
+from bms_estimator.pack_model.saved import Arrays, curve_arrays, fit_from_arrays
 
 COMPARED = np.dtype(
     [("soc", "f8"), ("filter_soc", "f8"), ("deviation_std", "f8"), ("mean", "f8", 2), ("covariance", "f8", (2, 2))],
@@ -160,7 +160,7 @@ def decode_result(data: bytes) -> FitResult:
     except KeyError as error:
         raise ValueError(f"not the result of a fit: {error} is missing") from None
     weakest = _weakest({name: arrays.pop(name) for name in list(arrays) if name.startswith(_WEAKEST)})
-    fit = fit_of_curves(arrays)
+    fit = fit_from_arrays(arrays)
     return FitResult(
         int(request),
         bool(is_fitted),

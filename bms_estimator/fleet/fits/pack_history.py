@@ -22,7 +22,7 @@ from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit, fit
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.saved import Arrays, history_arrays, history_of
+from bms_estimator.pack_model.saved import Arrays, history_arrays, history_from_arrays
 from bms_estimator.pack_model.slow_fit import MAX_FAILED_FITS, has_enough_data, min_filter_std
 
 NO_POSITION = RowsPosition(0, 0)
@@ -61,7 +61,7 @@ class PackHistory:
         """
         position, digest = position_of(arrays), digest_of(arrays)
         if "answered" in arrays:
-            self._history, self._last_fit = history_of(arrays)
+            self._history, self._last_fit = history_from_arrays(arrays)
             self._new_rows, self._failures, self.answered = (
                 int(arrays[name]) for name in ("new_rows", "failures", "answered")
             )

@@ -22,7 +22,7 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock, SampleStatus
 from bms_estimator.telemetry.alarms.causes import LOSS_TEXTS, find_unknown, suspect_texts
-from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIES, SENSOR_SUSPECTS, Evaluation
+from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIES, SENSOR_SUSPECTS, EvaluationKernel
 from bms_estimator.telemetry.alarms.message import AlarmMessage as AlarmContent
 from bms_estimator.telemetry.alarms.message import RaisedAlarm, alarm_payload
 from bms_estimator.telemetry.alarms.sensor_faults import PROBE_TEXT, WRONG_CLOCK_TEXT
@@ -40,7 +40,7 @@ class PackAlarms:
     def __init__(self, record: NDArray[np.void]) -> None:
         self._alarms, self._estimator = record["alarms"], record["estimator"]
         self._states: NDArray[np.void] = self._alarms[0]["states"]
-        self._evaluation = Evaluation()
+        self._evaluation = EvaluationKernel()
         self._samples: SampleBlock = np.zeros(0, SAMPLE)  # last samples of the block
         self._impossible: list[str] = []  # descriptions of impossible values in ``_samples``
         self._has_events = False  # True if the block has changed the estimator in a way that is an event

@@ -23,7 +23,7 @@ from bms_estimator.kernels.accumulators.history import MAX_ROWS, MIN_FREE_ROWS
 from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import adopt_curves
-from bms_estimator.pack_model.saved import curve_arrays, fit_of_curves
+from bms_estimator.pack_model.saved import curve_arrays, fit_from_arrays
 from bms_estimator.pack_model.slow_fit import ADOPT_DELAY_S, fit_interval
 
 MAX_CACHED_CURVES = 4096
@@ -192,6 +192,6 @@ def weakest_of_record(record: np.void) -> ComparedCell | None:
 def fit_of_record(record: np.void) -> PackFit:
     """Return the fit in a record of dtype ``PACK_FIT``."""
     arrays: dict[str, NDArray[Any]] = {name: np.asarray(record[name]) for name in PACK_FIT.names or ()}
-    fit = fit_of_curves(arrays)
+    fit = fit_from_arrays(arrays)
     assert fit is not None  # noqa: S101 - for the type checker: there are arrays
     return replace(fit, is_exchanged=bool(record["is_exchanged"]))

@@ -29,7 +29,7 @@ NOISE_V, RESOLUTION_V = 2e-3, 1e-3
 """Std of the noise of a voltage sample, and resolution [V]."""
 HEALTHY_DISCHARGES = 2
 """Number of discharges of the healthy bank that are the reference."""
-APART = 0.1
+MIN_DIP_DISTANCE = 0.1
 """Minimum distance of two dips, as a fraction of the capacity."""
 MIN_VOLTAGE_V = 0.01
 """Voltage below which a sample of one battery is rejected [V]. A battery that is over-discharged to 0 V is no glitch here."""
@@ -70,7 +70,7 @@ class BankExperiment:
         return self._e_o(self._faulty_rows)
 
     @cached_property
-    def warning(self) -> float:
+    def drawn_at_warning(self) -> float:
         """Charge drawn at which the comparison with the healthy discharges finds a weak battery."""
         rows, soc = self._faulty_rows, self._soc(self._faulty_rows)
         for end in range(MIN_ROWS, rows.size):
@@ -86,7 +86,7 @@ class BankExperiment:
         slope_v, middle = np.diff(lost_v) / np.diff(self.faulty.drawn), midpoints(self.faulty.drawn)
         found: list[float] = []
         for j in np.argsort(-slope_v).tolist():
-            if len(found) < len(WEAK_SOC) and all(abs(middle[j] - other) > APART for other in found):
+            if len(found) < len(WEAK_SOC) and all(abs(middle[j] - other) > MIN_DIP_DISTANCE for other in found):
                 found.append(float(middle[j]))
         return sorted(found)
 

@@ -1,8 +1,8 @@
 """Claims of chapters 4 to 7 of the thesis about its recordings, tested on other captures.
 
-The captures are real, or the simulated pack is measured by two sensor chains. A claim holds if the error is at most the printed value on more than half of the captures. For the SOC and the RC
-products the thesis prints no value that could be a limit. Their limits, and the limit 1 of the ratio between the
-dynamic and the static model, are chosen here.
+The captures are real, or the simulated pack is measured by two sensor chains. A claim holds if the error is at most the printed
+value on more than half of the captures. For the SOC and the RC products the thesis prints no value that could be a limit. Their
+limits, and the limit 1 of the ratio between the dynamic and the static model, are chosen here.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -126,7 +126,7 @@ def _soc_difference(p: Procedure) -> list[Result]:
     return [
         Result(
             c.name,
-            100.0 * float(np.sqrt(np.mean((p.interpolated(c.name)[0] - p.dynamic[c.name].soc) ** 2))),
+            100.0 * float(np.sqrt(np.mean((p.interpolate_soc(c.name)[0] - p.dynamic[c.name].soc) ** 2))),
             SOC_PERCENT,
         )
         for c in p.validating
@@ -217,7 +217,7 @@ COARSE = SensorChain(bits=10)
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedCaptures:
     """Real captures.
 
     Attributes:
@@ -238,7 +238,7 @@ class Experiment:
         recorded: Real captures; None for the simulated pack.
     """
 
-    def __init__(self, recorded: Recorded | None = None) -> None:
+    def __init__(self, recorded: RecordedCaptures | None = None) -> None:
         self.recorded = recorded
 
     @cached_property
@@ -265,7 +265,7 @@ class Experiment:
         return Procedure(pack(), captures(self._true_captures, COARSE), COARSE.voltage_step_v)
 
     def verdict_on_claims(self, *keys: str) -> tuple[Reproduction, str]:
-        """Return the common verdict on the claims ``keys`` of ``claims.CLAIMS``, and its reason.
+        """Return the common verdict on the claims ``keys`` of ``CLAIMS``, and its reason.
 
         No claim is tested on the simulated pack, because the pack has exactly the form of the model.
         """
@@ -292,5 +292,5 @@ class Experiment:
 
     @property
     def data_note(self) -> str:
-        """Sentence on the data, and the reason for which the printed numbers cannot be reproduced."""
+        """Sentence on the data, and the reason why the printed numbers cannot be reproduced."""
         return f"The thesis's recordings are not published. Its procedure was run on {self.data_source}."

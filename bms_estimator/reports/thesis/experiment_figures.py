@@ -176,7 +176,7 @@ def _largest_error(p: Procedure, names: list[str]) -> str:
     return f"Largest error {max(p.dynamic[name].max_percent for name in names):.2f} %."
 
 
-def _grid(names: list[str], draw_load: Callable[[Any, str], None], key: str) -> str:
+def _plots_by_load(names: list[str], draw_load: Callable[[Any, str], None], key: str) -> str:
     """Return a figure with one plot for each load in ``names``, drawn by ``draw_load``; empty without loads."""
     if not names:
         return ""
@@ -220,13 +220,13 @@ def figure_32(experiment: Experiment) -> Figure:
     """Draw the voltages under constant loads."""
     p = experiment.procedure
     title = "Constant loads: actual and estimated voltage"
-    return _figure("32", title, _grid(constant_loads(p), _voltages(p), "32"), experiment, "")
+    return _figure("32", title, _plots_by_load(constant_loads(p), _voltages(p), "32"), experiment, "")
 
 
 def figure_33(experiment: Experiment) -> Figure:
     """Draw the errors under constant loads."""
     p = experiment.procedure
-    svg = _grid(constant_loads(p), _errors(p), "33")
+    svg = _plots_by_load(constant_loads(p), _errors(p), "33")
     reason = f"{_largest_error(p, constant_loads(p))} Printed: at most {printed_values.MAX_CONSTANT:g} %."
     return _figure("33", "Constant loads: error", svg, experiment, reason, claims=("constant loads, largest",))
 
@@ -240,7 +240,7 @@ def figure_34(experiment: Experiment) -> Figure:
 def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> Figure:
     p = experiment.procedure
     names = step_loads(p)[index : index + 1] or step_loads(p)[-1:]
-    return _figure(key, title, _grid(names, _voltages(p), key), experiment, _largest_error(p, names))
+    return _figure(key, title, _plots_by_load(names, _voltages(p), key), experiment, _largest_error(p, names))
 
 
 def figure_35(experiment: Experiment) -> Figure:
@@ -264,7 +264,7 @@ def figure_38(experiment: Experiment) -> Figure:
     """Draw the errors under steps."""
     p = experiment.procedure
     reason = f"{_largest_error(p, step_loads(p))} Printed: at most {printed_values.MAX_STEPS:g} %."
-    svg = _grid(step_loads(p), _errors(p), "38")
+    svg = _plots_by_load(step_loads(p), _errors(p), "38")
     return _figure("38", "Steps: error", svg, experiment, reason, claims=("steps, largest",))
 
 
@@ -279,7 +279,7 @@ def figure_40(experiment: Experiment) -> Figure:
 def figure_41(experiment: Experiment) -> Figure:
     """Draw the SOC by interpolation."""
     p = experiment.procedure
-    run, (soc, _) = p.dynamic[p.largest_load], p.interpolated(p.largest_load)
+    run, (soc, _) = p.dynamic[p.largest_load], p.interpolate_soc(p.largest_load)
     rms = float(np.sqrt(np.mean((soc - run.soc) ** 2)))
 
     def draw(axes: Any) -> None:
@@ -305,7 +305,7 @@ def figure_41(experiment: Experiment) -> Figure:
 def figure_42(experiment: Experiment) -> Figure:
     """Draw E_o over the counted and the interpolated SOC."""
     p = experiment.procedure
-    run, (soc, e_o) = p.dynamic[p.largest_load], p.interpolated(p.largest_load)
+    run, (soc, e_o) = p.dynamic[p.largest_load], p.interpolate_soc(p.largest_load)
 
     def draw(axes: Any) -> None:
         x, y = thin(run.soc, e_o)

@@ -1,6 +1,6 @@
 """Tables 8 to 11 and 13 of the thesis: results of the procedure of chapter 5, with the printed values.
 
-Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata (``errata``).
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE
 from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora
-from bms_estimator.calibration.ocv.points import max_v, pooled, rms_v
+from bms_estimator.calibration.ocv.points import max_v, pool_tests, rms_v
 from bms_estimator.reports.formats import number
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.experiment import Experiment
@@ -20,7 +20,7 @@ from bms_estimator.reports.thesis.report_items import Reproduction, Table
 def table_8(experiment: Experiment) -> Table:
     """Return the table of a16 to a21."""
     procedure, truth = experiment.procedure, experiment.truth
-    points = pooled(procedure.tests)
+    points = pool_tests(procedure.tests)
     mean, joint = average(procedure.single_fits), procedure.joint_fit
     columns = ["parameter", "printed"]
     columns += [] if truth is None else ["true"]

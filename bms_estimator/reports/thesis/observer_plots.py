@@ -1,6 +1,6 @@
 """Plots of the adaptive observer that figures of simulations and of experiments share.
 
-Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata (``errata``).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ NO_VALUES = "The thesis prints no value of the figure that could be compared."
 """Reason of a figure without printed values."""
 
 
-def tracking(run: AdaptiveRun, label: str) -> Callable[[Any], None]:
+def tracking_plot(run: AdaptiveRun, label: str) -> Callable[[Any], None]:
     """Return a function that draws measured and estimated voltage at run time."""
 
     def draw(axes: Any) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, rest_current_a
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv.points import pooled
+from bms_estimator.calibration.ocv.points import pool_tests
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, relaxation_test
 from bms_estimator.calibration.ocv.table_fit import TableFit, fit_table
 from bms_estimator.calibration.thesis.adapt import printed_bounds
@@ -147,17 +147,17 @@ class Procedure:
     @cached_property
     def single_fits(self) -> list[ChenMoraFit]:
         """Fits of (2.10) to each test, whose parameters the thesis averages by (5.1)-(5.2)."""
-        return [fit_chen_mora(pooled([test])) for test in self.tests]
+        return [fit_chen_mora(pool_tests([test])) for test in self.tests]
 
     @cached_property
     def joint_fit(self) -> ChenMoraFit:
         """Fit of (2.10) to all tests together."""
-        return fit_chen_mora(pooled(self.tests))
+        return fit_chen_mora(pool_tests(self.tests))
 
     @cached_property
     def table(self) -> TableFit:
         """Monotone table through the points of all tests."""
-        return fit_table(pooled(self.tests))
+        return fit_table(pool_tests(self.tests))
 
     @cached_property
     def lowest_soc(self) -> float:
@@ -265,7 +265,7 @@ class Procedure:
         constant = self.captures_of(Kind.CONSTANT) or self.loads[:1]
         return max(constant, key=lambda c: float(np.median(c.samples["current_a"]))).name
 
-    def interpolated(self, name: str) -> tuple[Floats, Floats]:
+    def interpolate_soc(self, name: str) -> tuple[Floats, Floats]:
         """Return SOC and E_o by the interpolation of section 7.1 over the load ``name``."""
         cell = self.cell_with_ocv.model_copy(update={"r_s": self.r_s_without(name).element})
         return soc_by_interpolation(cell, self.dynamic[name])

@@ -1,10 +1,9 @@
 """Response of the thesis's observer, (3.1)-(3.3), to a constant current with true parameters, for errata 15, 16 and 27.
 
 x2 and x3 are the voltages of the RC pairs of the cell, x2^ and x3^ the voltages of the RC pairs of the observer. e is the
-error of the observer, N its gain. Both RC pairs
-of the observer are driven by one input u, but the RC pairs of the cell by i/C_ts and i/C_tl. If x2^ and x3^ change
-slowly, u = x2^/tau_ts = x3^/tau_tl. Therefore x2^ : x3^ is tau_ts : tau_tl in the observer, but x2 : x3 is R_ts : R_tl
-in the cell. Since u = -N e is not zero, e is not zero either.
+error of the observer, N its gain. Both RC pairs of the observer are driven by one input u, but the RC pairs of the cell by
+i/C_ts and i/C_tl. If x2^ and x3^ change slowly, u = x2^/tau_ts = x3^/tau_tl. Therefore x2^ : x3^ is tau_ts : tau_tl in the
+observer, but x2 : x3 is R_ts : R_tl in the cell. Since u = -N e is not zero, e is not zero either.
 """
 
 from dataclasses import dataclass
@@ -68,14 +67,14 @@ def quasi_steady(cell: CellModel, current_a: float) -> QuasiSteady:
     )
     estimator.run(to_samples(time_s, np.full(time_s.size, current_a), voltage_v))
     observer_state = estimator.state[0]
-    ohm_s = r_s(cell_state[0], a)
+    r_s_ohm = r_s(cell_state[0], a)
     tau_ts, tau_tl = r_ts(cell_state[0], a) * c_ts(cell_state[0], a), r_tl(cell_state[0], a) * c_tl(cell_state[0], a)
     return QuasiSteady(
         cell_v=(cell_state[1], cell_state[2]),
         observer_v=(float(observer_state["v_ts"]), float(observer_state["v_tl"])),
         tau_s=(tau_ts, tau_tl),
-        ohmic_v=current_a * ohm_s,
-        driven_v=-float(observer_state["gain"]) * float(observer_state["innovation_v"]) * ohm_s,
+        ohmic_v=current_a * r_s_ohm,
+        driven_v=-float(observer_state["gain"]) * float(observer_state["innovation_v"]) * r_s_ohm,
         error_v=float(observer_state["innovation_v"]),
         predicted_v=-float(observer_state["v_ts"]) / (float(observer_state["gain"]) * tau_ts),
     )

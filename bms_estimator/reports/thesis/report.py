@@ -14,7 +14,7 @@ from bms_estimator.reports.thesis import (
     simulation_figures,
     simulation_tables,
 )
-from bms_estimator.reports.thesis.experiment import Experiment, Recorded
+from bms_estimator.reports.thesis.experiment import Experiment, RecordedCaptures
 from bms_estimator.reports.thesis.report_items import Figure, Item, Reproduction, Table, label, name
 from bms_estimator.reports.thesis.simulation import Simulation
 
@@ -40,7 +40,7 @@ FUEL_CELL_REASONS = dict.fromkeys(
     "The recording is not published, nor are the equations of its model. The project's own model of a fuel cell, after section "
     "7.3, is in docs/theory/fuel-cell.md.",
 )
-"""Reason for which the figures of a fuel cell are not reproduced, by number."""
+"""Reason why the figures of a fuel cell are not reproduced, by number."""
 
 CHAPTERS: dict[str, tuple[str, ...]] = {
     "2  The model and the Nussbaum gain": ("F1", "F2", "F3", "F4", "F5", "F6", "F7", "F8", "F9", "F10"),
@@ -120,7 +120,7 @@ def _diagram(key: str) -> Callable[[], Item]:
 
 
 def build(
-    recorded: Recorded | None = None,
+    recorded: RecordedCaptures | None = None,
     *,
     table: str | None = None,
     figure: str | None = None,

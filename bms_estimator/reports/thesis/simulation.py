@@ -175,7 +175,7 @@ class Simulation:
         """Samples of the cell at 0.275 A, with a shorter interval in the first minute."""
         return discharge(self.cell, CURRENT_A, AFTER_START_S, START_TIMES_S)
 
-    def _started(self, law: str, start_v: float, lambda_: float, alpha: float) -> AdaptiveRun:
+    def _run_from_start(self, law: str, start_v: float, lambda_: float, alpha: float) -> AdaptiveRun:
         """Run a scheme from x2 = x3 = start_v / 2."""
         estimator = self._observer(law, lambda_, alpha)
         estimator.run(self.started_truth[:1])
@@ -215,14 +215,14 @@ class Simulation:
         shifts = {"scheme-1": printed_values.TABLE_2_SHIFT, "scheme-2": printed_values.TABLE_3_SHIFT}
 
         def residuals(start_v_and_lambda: Floats) -> list[float]:
-            runs = (self._started(law, start_v_and_lambda[0], start_v_and_lambda[1], alpha) for law in shifts)
+            runs = (self._run_from_start(law, start_v_and_lambda[0], start_v_and_lambda[1], alpha) for law in shifts)
             return [
                 float(run.average[2] - printed_values.CHEN_MORA_ROUNDED[1]) / shift - 1.0
                 for run, shift in zip(runs, shifts.values(), strict=True)
             ]
 
         start_v, lambda_ = least_squares(residuals, (near_v, near_lambda), xtol=1e-3).x
-        runs = [self._started(law, start_v, lambda_, alpha) for law in shifts]
+        runs = [self._run_from_start(law, start_v, lambda_, alpha) for law in shifts]
         ohmic_v = CURRENT_A * r_s(1.0, self.cell.a)
         r_s_of_observer = r_s(1.0, np.r_[0.0, printed_values.CHEN_MORA_ROUNDED])
         # the error (3.15) of the output (3.14), which contains u R_s with u = -N e and N(0) = 1

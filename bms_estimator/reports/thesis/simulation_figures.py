@@ -25,7 +25,7 @@ from bms_estimator.reports.thesis.observer_plots import (
     error_plot,
     frozen_plot,
     products_plot,
-    tracking,
+    tracking_plot,
 )
 from bms_estimator.reports.thesis.report_items import Figure, Reproduction
 from bms_estimator.reports.thesis.simulation import (
@@ -128,7 +128,7 @@ def figure_13(s: Simulation) -> Figure:
     return Figure(
         "13",
         "Scheme 1: y(t) and ŷ(t) at run time",
-        plot(tracking(run, "ŷ, scheme 1"), salt="figure-13"),
+        plot(tracking_plot(run, "ŷ, scheme 1"), salt="figure-13"),
         Reproduction.RECOMPUTED,
         f"{NO_VALUES} The observer's output follows the cell's, as the thesis says. Sign of N as E1; start and λ of E25.",
     )
@@ -309,11 +309,11 @@ def figure_43(s: Simulation) -> Figure:
             axes.plot(discharge.drawn, discharge.e_o_v, label=label)
         for drawn in dips:
             axes.axvline(drawn, color=FAINT, linestyle="--", label="located dip" if drawn == dips[0] else None)
-        axes.axvline(bank.warning, color=COLORS[2], linestyle=":", label="warning")
+        axes.axvline(bank.drawn_at_warning, color=COLORS[2], linestyle=":", label="warning")
         axes.set(xlabel="charge drawn, in capacities of one battery", ylabel="E_o of the bank [V]")
         axes.legend()
 
-    found = " and ".join(f"{drawn:.2f}" for drawn in dips)
+    located = " and ".join(f"{drawn:.2f}" for drawn in dips)
     return Figure(
         "43",
         "E_o of a healthy bank and of one with two weak batteries",
@@ -321,8 +321,8 @@ def figure_43(s: Simulation) -> Figure:
         Reproduction.NO_DATA,
         f"The bank's batteries and their SOC are not printed; here three cells of Chen and Mora in series under a load of {LOAD_C:g} C, "
         f"two of which start at SOC {WEAK_SOC[0]:g} and {WEAK_SOC[1]:g}. E_o is the measured voltage, corrected for the load. As in print, "
-        f"each weak battery causes a dip when it is empty. The dips are located at {found} of the charge, where E_o falls fastest below "
-        f"that of the healthy bank. The comparison with two healthy discharges warns at {bank.warning:.2f}. The sum does not show which "
+        f"each weak battery causes a dip when it is empty. The dips are located at {located} of the charge, where E_o falls fastest below "
+        f"that of the healthy bank. The comparison with two healthy discharges warns at {bank.drawn_at_warning:.2f}. The sum does not show which "
         "battery is weak.",
     )
 

@@ -1,6 +1,6 @@
 """Tables 1 to 7 and 12 of the thesis with printed and recomputed values, and a test of Theorem 4.1.2.
 
-Numbers in parentheses are equations of the thesis, and E1 to E36 are its errata (``errata``).
+Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata (``errata``).
 """
 
 from collections.abc import Callable

@@ -14,14 +14,14 @@ from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.causes import Causes
-from bms_estimator.telemetry.alarms.definitions import QUANTITIES, AlarmDefinitions, Evaluation
+from bms_estimator.telemetry.alarms.definitions import QUANTITIES, AlarmDefinitions, EvaluationKernel
 from bms_estimator.telemetry.alarms.message import AlarmMessage, Change, RaisedAlarm, alarm_payload
 from bms_estimator.telemetry.alarms.saved_state import SavedState
 
 ALWAYS_WATCHED: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost", "alarm_state_lost"))
 """Alarms that are watched even before the first sample."""
 NO_VALUE = "no value yet"
-"""Reason why the value of an alarm is not known whose quantities are measured, for example before a bank has a reference."""
+"""Reason for an unknown value of an alarm whose quantities are measured, for example before a bank has a reference."""
 
 
 class AlarmList:
@@ -33,14 +33,14 @@ class AlarmList:
     Attributes:
         record: State of the alarms, shape (1,), dtype ``ALARMS``.
         states: States of the alarms by position, dtype ``ALARM``; a view.
-        kernel: Call of the kernel that updates ``record``.
+        kernel: Kernel that updates ``record``.
         causes: Causes of the alarms.
         positions: Position of each monitored alarm.
         silence_reason: Reason why no samples arrive; empty while they arrive. ``set_silence`` changes it.
     """
 
     def __init__(self, definitions: AlarmDefinitions) -> None:
-        self.definitions, self.kernel, self.causes = definitions, Evaluation(), Causes()
+        self.definitions, self.kernel, self.causes = definitions, EvaluationKernel(), Causes()
         self.positions = {each.name: k for k, each in definitions.by_position.items()}
         self.record: NDArray[np.void] = np.zeros(1, ALARMS)
         self.states: NDArray[np.void] = self.record["states"][0]
@@ -118,7 +118,7 @@ class AlarmList:
         """Take the changes from the log of the kernel.
 
         Args:
-            reason_at: Returns the cause of the alarm ``collapse_risk`` that was raised at a time on the samples' clock [s].
+            reason_at: Returns the cause of ``collapse_risk`` from the time of its raise on the samples' clock [s].
         """
         has_reasons = False
         for k, kind, at_s, since_s, value in self.kernel.entries.tolist():
@@ -146,7 +146,7 @@ class AlarmList:
         return changes
 
     def report(self) -> tuple[Alarm, ...]:
-        """Return all alarms whose quantities were ever measured, which alone can become unwatched, and those that are raised.
+        """Return the raised alarms, and all whose quantities were ever measured. Only the latter can become unwatched.
 
         An alarm that was raised since the last call is reported as raised, even if it has ended. An alarm without a value is
         reported as well, so that receivers learn that it is watched again, also after an outage of an earlier run.

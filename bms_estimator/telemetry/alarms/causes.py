@@ -27,7 +27,7 @@ class Causes:
 
     Attributes:
         input_faults: Faults of the input that ``sensor_fault`` describes.
-        board: Reason why the board's resets raise ``sensor_fault``; empty: none.
+        board: Reason why the board's resets raise ``sensor_fault``; empty if they do not.
         unwatched: Alarms that cannot be watched, each with the reason.
         unknown: Alarms whose value is not known, each with the reason.
     """
@@ -119,14 +119,15 @@ class Causes:
 
 
 def suspect_texts(suspects: InputFault, suspicions: Sequence[str]) -> tuple[str, ...]:
-    """Return those of the suspicions that describe ``suspects``. Each ends in the text of its fault."""
+    """Return the suspicions that describe ``suspects``. Each suspicion ends in the text of its fault."""
     return tuple(text for text in suspicions for suspect in suspects if text.endswith(suspect.text))
 
 
 def find_unknown(row: np.void, *, soc_known: bool) -> dict[AlarmName, str]:
     """Return the alarms whose value is not known although the quantities that they need are measured, each with the reason.
 
-    A fuel cell has no such alarm, because it has no SOC. The probability of ``collapse_risk`` includes the uncertainty of the SOC.
+    A fuel cell has no such alarm, because it has no SOC. The probability of ``collapse_risk`` includes the uncertainty of the
+    SOC.
 
     Args:
         row: The last estimate, dtype TRACE.

@@ -1,4 +1,4 @@
-"""Definitions of a pack's alarms as records of the kernels, and the call of the kernel."""
+"""Definitions of a pack's alarms as records of the kernels, and the kernel with its buffers."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple, Self, get_args
@@ -28,8 +28,8 @@ SENSOR_SUSPECTS = (
 MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
 """Input faults that raise ``model_mismatch``."""
 NO_RISK = np.full(1, np.nan)
-"""Probability of the cut-off at all estimates of a pack without forecasts."""
-_CHANGES_OF_SAMPLE = len(NAMES)
+"""Probability of a cut-off for a pack without forecasts."""
+_MAX_CHANGES_PER_SAMPLE = len(NAMES)
 """Maximum number of changes by a sample and its estimate."""
 
 
@@ -84,16 +84,16 @@ class AlarmDefinitions(NamedTuple):
         return cls(by_position, limits, record, bounds)
 
 
-class Evaluation:
-    """Call of the kernel, with its buffers.
+class EvaluationKernel:
+    """Kernel that evaluates the alarms, with its buffers.
 
     Attributes:
-        part: Values beside the samples, and results; shape (1,), dtype ``PART``.
+        part: Further inputs of the kernel and its results, shape (1,), dtype ``PART``.
         log: Buffer of the changes, dtype ``LOG``; ``entries`` returns those since the last call of ``clear``.
     """
 
     def __init__(self) -> None:
-        self.part, self.log = np.zeros(1, PART), np.zeros(_CHANGES_OF_SAMPLE, LOG)
+        self.part, self.log = np.zeros(1, PART), np.zeros(_MAX_CHANGES_PER_SAMPLE, LOG)
         for name in ("cells_at_s", "short_a", "reading_v", "weak_cell_std"):
             self.part[name] = np.nan
         self._scratch = np.zeros((6, SAMPLE_ALARMS))
@@ -111,7 +111,7 @@ class Evaluation:
         """Evaluate all alarms as ``kernels.alarms.evaluate`` does, with buffers that are long enough."""
         if self._scratch.shape[1] < samples.size:
             self._scratch = np.zeros((6, samples.size))
-        rows = int(self.part["logged"][0]) + _CHANGES_OF_SAMPLE * (samples.size + 1)
+        rows = int(self.part["logged"][0]) + _MAX_CHANGES_PER_SAMPLE * (samples.size + 1)
         if self.log.size < rows:
             self.log = np.concatenate((self.entries, np.empty(rows, LOG)))
         return evaluate(

@@ -30,11 +30,11 @@ from bms_estimator.telemetry.cells import CellAlarmInputs
 from bms_estimator.telemetry.health import suspicions
 
 MIN_WATCHED_S = 10.0
-"""Minimum duration of the samples after which alarms count as watched [s]. The delays of most critical alarms are not longer."""
+"""Minimum time with samples before alarms count as watched [s]. The delays of most critical alarms are not longer."""
 TEMPERATURE_ALARMS: frozenset[AlarmName] = frozenset(
     {"over_temperature", "under_temperature", "charging_below_freezing"}
 )
-"""Alarms that a missing probe may hold."""
+"""Alarms that a missing probe can keep raised."""
 _SUSPECTS: Mapping[AlarmName, InputFault] = {"sensor_fault": SENSOR_SUSPECTS, "model_mismatch": MODEL_SUSPECTS}
 """Input faults that raise an alarm, by alarm."""
 
@@ -86,12 +86,12 @@ class AlarmEvaluator:
         Args:
             samples: Samples.
             trace: Their estimates.
-            cells_v: Their cell voltages [V]; empty without any.
+            cells_v: Their cell voltages [V]; empty if there are none.
             arrival_s: Arrival of the last sample on the wall clock [s since 1970].
             forecasts: Forecast at each row of ``trace``.
-            probes: Their temperature probes; empty without any.
+            probes: Their temperature probes; empty if there are none.
             cells_fault: Reason why the cell voltages cannot be used; empty if they can.
-            clock_fault: Fault of the source's clock as a sentence; empty without one.
+            clock_fault: Fault of the source's clock as a sentence; empty without a fault.
             lost: Number of samples since start that were lost on the line.
             cell_alarm_inputs: New faults of single cells; None without a new estimate.
             weak_cell_std: Deviation of the last discharge from the bank's reference [std]; NaN if unknown.
@@ -142,7 +142,9 @@ class AlarmEvaluator:
         alarms, is_silent = self._alarms, silent_s >= self._silence_limit_s
         if is_silent:
             alarms.kernel.part["watched_s"], self._silence_s = math.nan, steady_s
-        elif alarms.silence_reason:  # alarms are raised before it ends, so that a relay does not close in between
+        elif (
+            alarms.silence_reason
+        ):  # due alarms are raised before the silence ends, so that a relay does not close in between
             # the first samples may have waited in the buffers of a suspended process
             is_silent = steady_s - self._silence_s < MIN_WATCHED_S or not self.is_watching
         if is_silent != bool(alarms.silence_reason):
@@ -176,7 +178,7 @@ class AlarmEvaluator:
         """Raise ``sensor_fault`` without its delay while there is a reason.
 
         Args:
-            reason: Reason why the board's resets are a fault; empty: they are none.
+            reason: Reason why the board's resets are a fault; empty if they are not.
             now_s: Wall clock [s since 1970].
         """
         if reason == self._alarms.causes.board:
@@ -239,7 +241,7 @@ class AlarmEvaluator:
                 cut its power. Alarms whose delay ran are then raised. None: it ended cleanly, and the delays resume.
 
         Returns:
-            Reason for which raised or due critical alarms are missing; empty if none are.
+            Reason why raised or due critical alarms are missing; empty if none are.
 
         Raises:
             ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError: The saved state is damaged.
@@ -260,9 +262,9 @@ class AlarmEvaluator:
         """Raise ``alarm_state_lost`` until it is acknowledged.
 
         Args:
-            reason: Reason for which raised alarms may be missing.
+            reason: Reason why raised alarms may be missing.
             now_s: Wall clock [s since 1970].
-            measured: Number of values in a sample of the earlier run, by quantity. One that does not arrive is lost.
+            measured: Number of values in a sample of the earlier run, by quantity. A quantity that does not arrive is lost.
         """
         alarms = self._alarms
         alarms.expect(measured)
@@ -292,6 +294,6 @@ class AlarmEvaluator:
         if probe_fault := self._probe_faults.take():
             faults.add("temperature", "probe", probe_fault)
         for quantity, row in zip(QUANTITIES, alarms.kernel.part["impossible"][0].tolist(), strict=True):
-            if row:
+            if row:  # one above the index of a sample; 0: no impossible value
                 cells = cells_v[row - 1] if len(cells_v) == samples.size else NO_CELLS
                 faults.add(quantity, *alarms.definitions.bounds.describe(quantity, samples[row - 1], cells))

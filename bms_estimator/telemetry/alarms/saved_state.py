@@ -29,7 +29,7 @@ class SavedState(NamedTuple):
     raised: dict[AlarmName, dict[str, float | bool]]
     """Fields of dtype ``ALARM`` of each raised alarm."""
     raised_critical: list[AlarmName]
-    """Names of the critical ones. They may not be monitored, because of edited settings or of another version."""
+    """Names of the raised critical alarms. New settings or another version may no longer monitor them."""
     pending: list[AlarmName]
     """Names of the critical alarms whose delay ran."""
     counts: dict[Quantity, tuple[int, bool]]
@@ -81,13 +81,13 @@ def encode(
 
 
 def decode(saved: str, series: int) -> SavedState:
-    """Decode a state for a pack with ``series`` cells in series, which may have had more of them.
+    """Decode a state for a pack that now has ``series`` cells in series, perhaps fewer than before.
 
     Raises:
         ValueError, TypeError, LookupError, AttributeError, ArithmeticError, OSError: The saved state is damaged.
     """
     text = json.dumps(json.loads(saved or "{}"), ensure_ascii=False)
-    entries = json.loads(text.encode(errors="replace"))  # half of a UTF-16 pair could not be published
+    entries = json.loads(text.encode(errors="replace"))  # a lone surrogate could not be published
     inputs, counts = entries.pop(INPUTS, {}), dict[Quantity, tuple[int, bool]]()
     for quantity in QUANTITIES:
         max_count, lost = inputs.get(quantity, (0, False))

@@ -14,7 +14,7 @@ FaultyInput = Quantity | Literal["time"]
 PROBE_TEXT = "a temperature probe is broken, loose or missing, or far from the others: check it"
 """Fault of temperature probes, and its remedy."""
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"
-"""Text of a wrong clock that is right again at the end of a recorded block."""
+"""Description of a clock fault that ended before the end of its block."""
 RESET_WINDOW_S = 1800.0
 """Time within which resets count as repeated [s]. It covers three resets at the longest waiting time of the relay."""
 MIN_RESETS = 3
@@ -93,7 +93,7 @@ class ProbeFaults:
         return samples
 
     def take(self) -> str:
-        """Return and clear the faulty probes, as one sentence with their last readings; empty without any.
+        """Return and clear the faulty probes, as one sentence with their last readings; empty if there are none.
 
         The sentence names no probe if the samples were received without a list of their probes.
         """

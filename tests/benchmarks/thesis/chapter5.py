@@ -145,7 +145,7 @@ def load_rows(name: str, p: Procedure) -> Iterator[tuple[str, ...]]:
     validating = [capture.name for capture in p.validating]
     for load, run in p.dynamic.items():
         aligned, above = run.aligned, run.above(KNEE_SOC)
-        soc, _ = p.interpolated(load)
+        soc, _ = p.interpolate_soc(load)
         yield (
             name,
             load,

@@ -83,16 +83,16 @@ def test_a_capture_without_ocv_is_held_back_first(captures) -> None:
     recognized = recognize([captures[name] for name in ("relaxation", "constant", "pulses")], TRUTH)
     split = hold_back(recognized)
     assert split.held_back is recognized[1]
-    assert [each.capture.name for each in split.resistances] == ["relaxation", "pulses"]
+    assert [each.capture.name for each in split.resistance_captures] == ["relaxation", "pulses"]
 
 
 def test_the_end_of_a_single_capture_is_held_back_from_the_resistances(captures) -> None:
     (recognized,) = recognize([captures["relaxation"]], TRUTH)
     split = hold_back([recognized])
-    first_part = split.resistances[0].capture.rows
+    first_part = split.resistance_captures[0].capture.rows
     assert split.held_back is recognized
     assert first_part["time_s"][-1] < split.held_back_from_s <= first_part["time_s"][-1] + 1.0
-    assert split.ocv == (recognized,)
+    assert split.ocv_captures == (recognized,)
 
 
 def test_one_relaxation_test_gives_a_model_with_errors_of_millivolts(captures) -> None:

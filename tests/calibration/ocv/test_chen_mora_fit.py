@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora, fit_chen_mora
-from bms_estimator.calibration.ocv.points import Points, max_v, pooled, rms_v
+from bms_estimator.calibration.ocv.points import Points, max_v, pool_tests, rms_v
 from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
 from bms_estimator.calibration.ocv.table_fit import fit_table
 from bms_estimator.model.cell import load_cell
@@ -90,7 +90,7 @@ def test_points_of_several_captures_are_pooled_in_the_order_of_soc():
     relaxation_tests = [
         relaxation_test(relaxation(rounds=10, seed=seed), TRUTH.cell.capacity_ah, name="mine") for seed in (0, 1)
     ]
-    pooled_points = pooled(relaxation_tests)
+    pooled_points = pool_tests(relaxation_tests)
     assert pooled_points.soc.size == len(relaxation_tests[0].rests) + len(relaxation_tests[1].rests)
     assert (np.diff(pooled_points.soc) >= 0.0).all()
     assert pooled_points.full_v == pytest.approx(0.5 * (relaxation_tests[0].full_v + relaxation_tests[1].full_v))

@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
 from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora
-from bms_estimator.calibration.ocv.points import pooled
+from bms_estimator.calibration.ocv.points import pool_tests
 from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
@@ -195,7 +195,7 @@ def test_bad_input_is_rejected_with_its_numbers(fault):
     simulate, capacity_ah, message = INVALID_CAPTURES[fault]
     samples = simulate()
     with pytest.raises(UserError) as caught:
-        fit_chen_mora(pooled([relaxation_test(samples, capacity_ah, name="mine")]))
+        fit_chen_mora(pool_tests([relaxation_test(samples, capacity_ah, name="mine")]))
     assert message in str(caught.value)
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from bms_estimator.calibration.cleaning.start_soc import StartSoc
 from bms_estimator.calibration.ocv.hysteresis import (
-    PLATEAU_SHARE,
-    REST_SHARE_STD,
+    PLATEAU_RESTED_FRACTION,
+    RESTED_FRACTION_STD,
     TYPICAL_HYSTERESIS_STD,
     center_on_typical_hysteresis,
 )
@@ -48,7 +48,7 @@ def test_a_slow_discharge_and_charge_give_ocv_hysteresis_and_capacity(files):
     assert source.kind.startswith("C/20 discharge and charge, 2.99")
     assert result.capacity_ah == result.measured_ah == pytest.approx(CAPACITY_AH, rel=2e-3)
     assert np.abs(ocv_error_v(result)).max() < 2e-3
-    # 0.7 is ``REST_SHARE``. The other part of the difference between charge and discharge is polarization.
+    # 0.7 is ``RESTED_FRACTION``. The other part of the difference between charge and discharge is polarization.
     assert result.hysteresis_v[INSIDE] == pytest.approx(0.7 * hysteresis_v(NODES[INSIDE]), abs=2e-3)
 
 
@@ -234,8 +234,8 @@ def test_lfp_pairs_at_three_temperatures_give_one_curve(shared_data):
     assert [round(source.temperature_c) for source in result.sources] == [25, 5, -15]
     half_v = np.interp(NODES, GRID, result.sources[0].hysteresis_v)
     assert 0.005 < half_v[INSIDE].min() < half_v[INSIDE].max() < 0.03
-    assert result.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v)
-    assert result.hysteresis_std_v == pytest.approx(REST_SHARE_STD * half_v)
+    assert result.hysteresis_v == pytest.approx(PLATEAU_RESTED_FRACTION * half_v)
+    assert result.hysteresis_std_v == pytest.approx(RESTED_FRACTION_STD * half_v)
     fit = fit_table(result.points)
     warm = result.sources[0].points
     plateau = (warm.soc > 0.15) & (warm.soc < 0.95)
@@ -251,7 +251,7 @@ def test_the_hysteresis_of_a_cold_pair_is_converted_to_25_c(shared_data):
         )
         temperature_factor = arrhenius(HYSTERESIS_ACTIVATION_ENERGY, result.sources[0].temperature_c)
         half_v = np.interp(NODES, GRID, result.sources[0].hysteresis_v)
-        assert result.hysteresis_v == pytest.approx(PLATEAU_SHARE * half_v / temperature_factor)
+        assert result.hysteresis_v == pytest.approx(PLATEAU_RESTED_FRACTION * half_v / temperature_factor)
         mean_v[at] = result.hysteresis_v[INSIDE].mean()
     assert 0.7 < mean_v["n15"] / mean_v["p25"] < 1.8
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
-from bms_estimator.calibration.ocv.points import Points, joined, max_v, rms_v
+from bms_estimator.calibration.ocv.points import Points, join_points, max_v, rms_v
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
 from bms_estimator.reports.thesis.printed_values import TABLE_1
 
@@ -81,8 +81,8 @@ def test_the_error_is_larger_in_a_gap_beyond_the_points_and_if_captures_disagree
     middle = int(np.argmin(np.abs(NODES - 0.56)))
     assert with_gap.error_v[middle] > 1.5 * without_gap.error_v[middle]
     assert without_gap.error_v[0] > 5.0 * without_gap.error_v[middle]
-    agreeing = fit_table(joined([make_points(soc), make_points(soc)]))
-    disagreeing = fit_table(joined([make_points(soc, offset_v=0.015), make_points(soc, offset_v=-0.015)]))
+    agreeing = fit_table(join_points([make_points(soc), make_points(soc)]))
+    disagreeing = fit_table(join_points([make_points(soc, offset_v=0.015), make_points(soc, offset_v=-0.015)]))
     assert disagreeing.error_v[middle] > 1.5 * agreeing.error_v[middle]
     assert disagreeing.deviation_v == pytest.approx([0.015, 0.015], rel=0.5)
 
@@ -90,7 +90,7 @@ def test_the_error_is_larger_in_a_gap_beyond_the_points_and_if_captures_disagree
 def test_the_more_certain_source_determines_the_curve():
     soc = np.linspace(0.05, 0.98, 45)
     fit = fit_table(
-        joined([make_points(soc, systematic_std_v=1e-3), make_points(soc, offset_v=0.02, systematic_std_v=0.02)])
+        join_points([make_points(soc, systematic_std_v=1e-3), make_points(soc, offset_v=0.02, systematic_std_v=0.02)])
     )
     inside = (NODES > 0.15) & (NODES < 0.95)
     assert max_v((fit.ocv_v - true_v(NODES))[inside]) < 2e-3
@@ -113,12 +113,12 @@ def test_the_temperature_coefficient_is_between_its_true_value_and_0(per_kelvin_
         make_points(soc, offset_v=per_kelvin_v * (t - 25.0), temperature_c=t, systematic_std_v=5e-4)
         for t in (15.0, 25.0, 45.0)
     ]
-    fitted_per_kelvin_v = fit_table(joined(at_temperatures)).per_kelvin_v
+    fitted_per_kelvin_v = fit_table(join_points(at_temperatures)).per_kelvin_v
     assert fitted_per_kelvin_v is not None
     assert fitted_per_kelvin_v[10:-10] == pytest.approx(np.full(NODES.size - 20, per_kelvin_v), rel=0.25)
     cold = make_points(soc, offset_v=-30.0 * per_kelvin_v, temperature_c=-5.0, systematic_std_v=4e-3)
     cold = replace(cold, cold_v=np.full(soc.size, 0.016))
-    with_cold_rests = fit_table(joined([at_temperatures[1], cold])).per_kelvin_v
+    with_cold_rests = fit_table(join_points([at_temperatures[1], cold])).per_kelvin_v
     assert with_cold_rests is not None
     # Incomplete relaxation in the cold is an equally likely cause of the difference.
     assert (np.abs(with_cold_rests[10:-10]) < 0.6 * abs(per_kelvin_v)).all()
@@ -127,7 +127,7 @@ def test_the_temperature_coefficient_is_between_its_true_value_and_0(per_kelvin_
 @pytest.mark.parametrize("temperatures_c", [(25.0, 30.0), (np.nan, np.nan)])
 def test_the_temperature_coefficient_requires_different_temperatures(temperatures_c):
     soc = np.linspace(0.05, 0.98, 45)
-    fit = fit_table(joined([make_points(soc, temperature_c=t) for t in temperatures_c]))
+    fit = fit_table(join_points([make_points(soc, temperature_c=t) for t in temperatures_c]))
     assert fit.per_kelvin_v is None
     assert fit.table().per_kelvin_v is None
 

@@ -7,7 +7,12 @@ unstable at a low SOC. Both ends are detected or given.
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.thesis.adaptive_run import AveragingWindow, adaptive_run, averaged, averaging_window
+from bms_estimator.calibration.thesis.adaptive_run import (
+    AveragingWindow,
+    adaptive_run,
+    average_parameters,
+    averaging_window,
+)
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
@@ -136,11 +141,11 @@ def test_the_mean_over_uneven_steps_is_weighted_by_time():
     time_s = np.cumsum(np.random.default_rng(1).uniform(0.01, 2.0, 5000))
     a = np.tile(time_s[:, None], (1, 16))  # a_i(t) = t, whose mean is the middle
     times_in_window = time_s[(time_s >= 500.0) & (time_s <= 2000.0)]
-    result = averaged(time_s, a, AveragingWindow(500.0, 2000.0, "given", "given"))
+    result = average_parameters(time_s, a, AveragingWindow(500.0, 2000.0, "given", "given"))
     assert result == pytest.approx(np.full(16, 0.5 * (times_in_window[0] + times_in_window[-1])), rel=1e-9)
 
 
 def test_mean_over_an_empty_window_is_the_last_value():
     a = np.tile(TIME_S[:, None], (1, 16))
-    assert averaged(TIME_S, a, AveragingWindow(5000.0, 6000.0, "given", "given"))[1] == TIME_S[-1]
-    assert averaged(TIME_S, a, AveragingWindow(10.0, 10.5, "given", "given"))[1] == 10.0
+    assert average_parameters(TIME_S, a, AveragingWindow(5000.0, 6000.0, "given", "given"))[1] == TIME_S[-1]
+    assert average_parameters(TIME_S, a, AveragingWindow(10.0, 10.5, "given", "given"))[1] == 10.0

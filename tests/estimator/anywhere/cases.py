@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import nnls
 
-from bms_estimator.calibration.ocv.hysteresis import REST_SHARE_STD
+from bms_estimator.calibration.ocv.hysteresis import RESTED_FRACTION_STD
 from bms_estimator.kernels.cell_model.rc_ladder import HIGH_ACTIVATION_ENERGY, LOW_ACTIVATION_ENERGY, TAU_S, arrhenius
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
@@ -268,7 +268,7 @@ def own_file(
     table = {
         "soc": GRID[OCV_NODES],
         "ocv_v": file_ocv_v + 1e-6 * np.arange(OCV_NODES.size),
-        "error_v": np.hypot(np.hypot(std_v, std_soc_v)[OCV_NODES], REST_SHARE_STD * hysteresis_v),
+        "error_v": np.hypot(np.hypot(std_v, std_soc_v)[OCV_NODES], RESTED_FRACTION_STD * hysteresis_v),
         "hysteresis_v": np.full(OCV_NODES.size, hysteresis_v),
     }
     ocv = TableOcv(form="table", **{name: tuple(column) for name, column in table.items()})

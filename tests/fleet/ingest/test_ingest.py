@@ -71,7 +71,9 @@ async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: Samp
     now_s = START_S
     settings = EdgeSettings(url=f"mqtt://127.0.0.1:{cluster.mqtt_port}", block_s=60.0)
     clock = Clock(wall=lambda: now_s)
-    async with BlockSender(settings, pack, folder, clock=clock, steady=lambda: now_s, handover_s=LONG_S) as edge:
+    async with BlockSender(
+        settings, pack, folder, clock=clock, steady=lambda: now_s, final_send_timeout_s=LONG_S
+    ) as edge:
         for part in np.array_split(rows, 10):
             now_s = float(part["time_s"][-1])
             part["time_s"] -= START_S

@@ -14,4 +14,4 @@ def test_dips_of_figure_43_are_located_where_the_weak_batteries_are_empty(bank: 
 
 
 def test_warning_of_figure_43_comes_before_the_first_dip(bank: BankExperiment) -> None:
-    assert bank.warning < bank.dips[0] - 0.2
+    assert bank.drawn_at_warning < bank.dips[0] - 0.2

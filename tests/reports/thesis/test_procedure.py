@@ -13,7 +13,7 @@ import pytest
 
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.thesis.experiment import CLAIMS, Claim, Experiment, Recorded, Result, claim
+from bms_estimator.reports.thesis.experiment import CLAIMS, Claim, Experiment, RecordedCaptures, Result, claim
 from bms_estimator.reports.thesis.experiment_figures import FIGURES, MAX_LOADS, constant_loads, step_loads
 from bms_estimator.reports.thesis.procedure import Capture, Kind, Procedure, kind_of, printed_bounds
 from bms_estimator.reports.thesis.report_items import Reproduction
@@ -96,7 +96,7 @@ def test_the_static_model_is_worse_on_every_load(procedure):
 
 
 def test_the_soc_by_interpolation_of_the_ocv_is_near_the_counted_one(procedure):
-    soc, ocv_v = procedure.interpolated("constant")
+    soc, ocv_v = procedure.interpolate_soc("constant")
     counted_soc = procedure.dynamic["constant"].soc
     assert 100.0 * np.sqrt(np.mean((soc - counted_soc) ** 2)) == pytest.approx(1.15, abs=0.05)
     assert ocv_v.shape == soc.shape
@@ -171,7 +171,7 @@ def test_a_single_constant_load_validates_and_step_2_uses_the_relaxation_test(le
 
 @pytest.mark.parametrize(("remaining", "missing"), [("steps", ("33", "34")), ("constant", ("36", "37", "38"))])
 def test_the_figure_of_a_missing_load_is_empty_with_a_reason(samples, remaining, missing):
-    recorded = Recorded(TRUTH, tuple((name, samples[name]) for name in ("relaxation", remaining)), 1e-3)
+    recorded = RecordedCaptures(TRUTH, tuple((name, samples[name]) for name in ("relaxation", remaining)), 1e-3)
     experiment = Experiment(recorded)
     figures = {key: FIGURES[key](experiment) for key in ("33", "34", "36", "37", "38")}
     assert {key for key, figure in figures.items() if not figure.svg} == set(missing)
@@ -183,7 +183,7 @@ def test_the_figure_of_a_missing_load_is_empty_with_a_reason(samples, remaining,
 
 def test_errors_of_the_leaf_cell_are_those_of_the_document(leaf_procedure):
     """The document is docs/theory/thesis.md."""
-    run, (soc, _) = leaf_procedure.dynamic["cc"], leaf_procedure.interpolated("cc")
+    run, (soc, _) = leaf_procedure.dynamic["cc"], leaf_procedure.interpolate_soc("cc")
     assert (run.mean_percent, run.max_percent) == pytest.approx((0.543, 2.37), abs=0.005)
     assert leaf_procedure.static["cc"].mean_percent == pytest.approx(0.517, abs=0.005)
     assert 100.0 * np.sqrt(np.mean((soc - run.soc) ** 2)) == pytest.approx(2.7, abs=0.05)
