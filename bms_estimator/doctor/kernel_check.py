@@ -17,7 +17,7 @@ MAX_OTHER_VERSIONS = 3
 
 
 def check_kernels(subject: Subject | None) -> Iterator[Finding]:
-    """Yield whether kernels are compiled, and whether they can be stored."""
+    """Yield findings on the compiled kernels, and on the folder in which they are stored."""
     if (SHIPPED_FOLDER / COMPLETE_FILE).exists():
         yield ok(NAME, f"{SHIPPED_FOLDER}: compiled kernels of the package")
         return

@@ -13,7 +13,7 @@ INVALID_SETTING = 2
 
 
 def check_service(subject: Subject) -> Iterator[Finding]:
-    """Yield whether the pack is served, and by which systemd unit."""
+    """Yield findings on the service of the pack and its systemd unit."""
     unit = subject.unit
     if unit is None:
         if subject.is_running:
@@ -34,7 +34,7 @@ def check_service(subject: Subject) -> Iterator[Finding]:
 
 
 def describe_unit(unit: SystemdUnit) -> Finding:
-    """Return whether a systemd unit runs, and otherwise how its last run ended."""
+    """Return the finding on the state of a systemd unit, and on the end of its last run."""
     restarts = f", {unit.restarts} restarts" if unit.restarts else ""
     journal = f"journalctl -u {unit.name} -n 20"
     if unit.active_state == "active":
@@ -51,7 +51,7 @@ def describe_unit(unit: SystemdUnit) -> Finding:
 
 
 def _ending(unit: SystemdUnit) -> str:
-    """Return how the last run of a unit ended."""
+    """Return the outcome of a unit's last run as text."""
     if unit.exit_status == os.EX_TEMPFAIL:
         return f"a fault of the environment, such as a missing folder or file, or another process (status {unit.exit_status})"
     return f"{unit.result}, status {unit.exit_status}"

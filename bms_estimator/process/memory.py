@@ -18,7 +18,7 @@ def available_bytes() -> int:
     """Return the memory that programs can use without swapping, on the machine and in each control group of this process [bytes]."""
     try:
         machine = _kib_of(Path("/proc/meminfo"), "MemAvailable") * 1024
-    except FileNotFoundError:  # ProcSubset=pid of a systemd unit hides the file
+    except FileNotFoundError:  # ProcSubset=pid of a systemd unit hides the file; half of the RAM counts as available
         machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     return max(0, min([machine, *_available_in_groups()]))
 
@@ -48,6 +48,7 @@ def _available_in_groups() -> Iterator[int]:
 
 
 def _available_below(root: Path, path: str, limit_file: str, used: str) -> Iterator[int]:
+    """Yield limit less use of the group ``path`` and of each of its parents that has a limit [bytes]."""
     group = root / path.lstrip("/")
     for folder in (group, *group.parents):
         if folder.is_relative_to(root):

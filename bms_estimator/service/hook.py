@@ -24,7 +24,7 @@ class Hook(ABC):
         failures: Number of failed attempts since start.
         relay_resets: Number of resets of the board that undid a relay command, since start.
         error: Reason why the last attempt failed; empty after a success.
-        has_watched: True once due alarms would have been raised.
+        has_watched: True after enough samples had arrived to raise all due alarms.
     """
 
     def __init__(self, settings: AlarmHook) -> None:
@@ -71,7 +71,7 @@ class Hook(ABC):
         self._raised.update({alarm.name: alarm for alarm in alarms if self.covers(alarm.name)})
 
     def close(self) -> None:
-        """Make the hook end after its waiting jobs."""
+        """Request that ``run`` returns after the waiting jobs."""
         self._closing = True
         self._wake.set()
 

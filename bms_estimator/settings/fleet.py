@@ -128,7 +128,7 @@ class FleetSettings(Strict):
         """Reject a server that other machines can reach without TLS and tenants.
 
         Args:
-            setting: Setting or option that makes the server client_address, for the error.
+            setting: Setting or option that makes the server reachable from other machines, for the error.
 
         Raises:
             ValueError: TLS or tenants are missing, so that any client could read and write all data.

@@ -56,9 +56,9 @@ class ObserverSettings(Strict):
     )
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Return names and values for ``repr``, whose hash marks stored states.
+        """Return names and values for ``repr``, whose hash identifies the settings of a stored state.
 
-        Constants that were settings before are included, so that the hashes of stored states stay valid.
+        Constants that earlier versions had as settings are included, so that the hashes of stored states stay valid.
         """
         yield from super().__repr_args__()
         yield "scheme_2_lambda", SCHEME_2_LAMBDA

@@ -37,7 +37,7 @@ class NewPack:
 
 
 def create_pack(file: Path, answers: Answers) -> NewPack:
-    """Check the settings of a pack, and write its settings file, and files with the passwords for brokers beside it.
+    """Check the settings of a pack. Write its settings file, and password files for its brokers to the same folder.
 
     Invalid settings are not written.
 

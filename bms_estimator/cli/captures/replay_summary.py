@@ -30,7 +30,7 @@ class LearnedParameter:
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """ReplayResult of a replay; None for missing numbers."""
+    """Result of a replay; None for missing numbers."""
 
     samples: int
     """Number of accepted samples."""
@@ -39,7 +39,7 @@ class ReplayResult:
     soc_initial: float | None
     soc_final: float | None
     soc_std_final: float | None
-    """Standard deviation by the identifier; None if the identifier is off."""
+    """Standard deviation that the identifier estimates; None if the identifier is off."""
     soc_rms_difference_to_coulomb: float | None
     innovation_rms_v: float | None
     """RMS of measured minus predicted voltage, before the correction by the measurement. Without the identifier, that of the observer."""

@@ -1,4 +1,4 @@
-"""``bms-estimator accuracy``: how well the SOC of a pack can be known in its use, and which change helps most."""
+"""``bms-estimator accuracy``: how accurately the SOC of a pack can be estimated in its use, and which change helps most."""
 
 import json
 import math
@@ -66,7 +66,7 @@ def accuracy(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute how well the SOC of a pack can be known, and which change of its use or equipment helps most.
+    """Compute how accurately the SOC of a pack can be estimated, and which change of its use or equipment helps most.
 
     The result is a lower bound: the std that remains however long the estimator runs, if it knows only the cell file.
     On average over the cells that the file describes, no estimator has a smaller error.
@@ -130,7 +130,6 @@ def _use_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, i
 
 
 def _print(result: AccuracyResult) -> None:
-    """Print the result as a table."""
     full = "" if result.full_charges is None else f", {result.full_charges} full charges"
     sensor = "" if result.has_temperature else ", no temperature sensor"
     typer.echo(f"SOC {result.low:.0%} to {result.high:.0%}{full}{sensor}")

@@ -67,7 +67,6 @@ def _stdout_is_terminal() -> bool:
 
 
 def _with_options(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
-    """Return the settings with the command line's options."""
     if mqtt:
         settings = with_broker(settings, mqtt)
     return with_sensor(settings, port=port)

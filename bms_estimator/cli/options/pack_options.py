@@ -17,8 +17,9 @@ from bms_estimator.settings.sensor import SensorSettings
 LABORATORY_RESOLUTION_V = 1e-3
 """Voltage resolution of laboratory equipment [V], assumed for a capture without a pack file."""
 PLATEAU_CELL, PLATEAU_GAIN_STD = "lfp", 0.01
-"""Generic cell with a plateau, and std of the voltage's gain assumed for its captures. 0.5 % is 16 mV, the step between the two
-plateaus. On three parts of a capture 1.6 % above the curve, 0.01 gave an SOC error of 2.9 to 6.2 %, and 0.005 2.6 to 7.4 %."""
+"""Generic cell with plateaus, and std of the voltage's gain assumed for its captures. ``BMS_GAIN_STD`` is an error
+of 16 mV, the step between the plateaus. On three parts of a capture 1.6 % above the OCV curve, 0.01 gave SOC errors of 2.9 to
+6.2 %, and 0.005 gave 2.6 to 7.4 %."""
 
 
 def load_pack(path: Path) -> tuple[Settings, PackModel]:
@@ -65,7 +66,8 @@ def pack_or_cell(
 def _unknown_sensor(cell: str) -> SensorSettings:
     """Return the sensor of a capture without a pack file.
 
-    A cell file may have been measured with the sensor of the capture. The gain relative to a generic cell is that of any sensor.
+    With a cell file, its gain error is that of a calibrated board, because the file may have been measured with the same sensor.
+    With a generic cell, it is that of any BMS.
     """
     generic_std = PLATEAU_GAIN_STD if cell == PLATEAU_CELL else BMS_GAIN_STD
     gain_std = generic_std if cell in generic_cells() else BOARD_GAIN_STD

@@ -35,8 +35,8 @@ CONVERSIONS: Mapping[Unit, tuple[float, float]] = {
 STALE_PERIODS, MIN_STALE_S = 3.0, 30.0
 """Default age at which a voltage or current is stale: in sample periods, and its minimum [s]."""
 ABSENT_PERIODS = 2.0
-"""Default age at which a temperature or cell voltage that was in each message and is no longer is stale, in sample periods. One
-message without it is tolerated."""
+"""Default age, in sample periods, at which a temperature or cell voltage is stale if every message contained it before, but
+later messages do not. One message without it is tolerated."""
 DEFAULT_RESOLUTION_V = 0.01
 """Voltage resolution of a publisher without a profile [V]."""
 
@@ -250,7 +250,7 @@ class MqttSource(BaseSource):
 
     @property
     def absent_s(self) -> float:
-        """Maximum age of a temperature or cell voltage that was in each message and is no longer [s]."""
+        """Maximum age of a temperature or cell voltage that every message contained before, but later messages do not [s]."""
         return self.max_age_s or ABSENT_PERIODS * self.interval_s
 
     @property
