@@ -23,7 +23,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.page_sink import Pages
-from bms_estimator.process.child_process import ends_with_us, find_server
+from bms_estimator.process.child_process import find_server, terminate_with_parent
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.mqtt import MqttSettings
@@ -96,7 +96,7 @@ class DemoBroker:
         config.write_text(_configuration(folder / "streams", self.port))
         process = await asyncio.create_subprocess_exec(
             *(self._server, "-c", config, "-l", log, "--ports_file_dir", folder),
-            preexec_fn=ends_with_us(),
+            preexec_fn=terminate_with_parent(),
             start_new_session=True,  # Ctrl-C in the terminal must end the service before its broker
         )
         stack.push_async_callback(_terminate, process)
@@ -149,7 +149,6 @@ def choose_port(port: int | None, default_port: int, option: str) -> int:
 
 
 def _is_free(port: int) -> bool:
-    """Return True if the port is free."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port with old connections in TIME_WAIT is free
         try:
@@ -179,11 +178,11 @@ SLOWDOWN = 500.0
 """Divisor of the weights in the adaptive law (3.18) of the thesis. With the printed weights, the law moves a1..a12 to their limits
 within half a second, too fast to be watched. A common divisor slows it down and leaves the limits unchanged."""
 REST_S = 60.0
-"""Rest of the cell while a1..a12 move [s]. R_s by (4.2) can be computed only after they have reached their limits, and only from a
-rest on, at which the RC voltages are known."""
+"""Rest of the cell at the start, in which a1..a12 reach their limits [s]. R_s by (4.2) is computed only after that. It requires
+the RC voltages, which are known after a rest."""
 RESOLUTION_V = 5e-3
-"""Resolution of the board's voltage [V]. The board averages noisy conversions, so that it is a fifth of the converter's
-step."""
+"""Resolution of the board's voltage [V]. It is a fifth of the converter's step, because the board averages noisy
+conversions."""
 PUBLISH_RATE_HZ = 4.0
 """Publish rate [Hz]."""
 LAMBDA = 1e4

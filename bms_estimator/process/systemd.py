@@ -8,7 +8,7 @@ from pathlib import Path
 
 CREDENTIALS = Path("/run/credentials")
 """Folder with the credentials of all systemd units."""
-EXTENSION_S = 120
+START_EXTENSION_S = 120
 """Extension of the start timeout [s]."""
 
 
@@ -68,8 +68,8 @@ class SystemdNotifier:
 
 
 def extend_start(status: str) -> None:
-    """Extend the start timeout of the systemd unit by ``EXTENSION_S``, and set its status text."""
-    _send(os.environ.get("NOTIFY_SOCKET", ""), f"EXTEND_TIMEOUT_USEC={EXTENSION_S * 10**6}\nSTATUS={status}")
+    """Extend the start timeout of the systemd unit by ``START_EXTENSION_S``, and set its status text."""
+    _send(os.environ.get("NOTIFY_SOCKET", ""), f"EXTEND_TIMEOUT_USEC={START_EXTENSION_S * 10**6}\nSTATUS={status}")
 
 
 def _send(address: str, state: str) -> None:
@@ -87,7 +87,7 @@ def credential(name: Path) -> Path:
     return path if os.access(path, os.R_OK) else name
 
 
-def is_for_the_service(name: Path) -> bool:
+def is_unreadable_credential(name: Path) -> bool:
     """Return True if ``name`` is the name or path of a systemd credential that this process cannot read.
 
     The service may be able to read it.
