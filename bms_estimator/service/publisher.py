@@ -40,11 +40,11 @@ from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capa
 
 log = structlog.get_logger(__name__)
 
-SLOW_S = 1.0
+SLOW_INTERVAL_S = 1.0
 """Minimum interval between two payloads of parameters, health or info, at any publish rate [s]."""
-FORECAST_S = 60.0
+FORECAST_INTERVAL_S = 60.0
 """Minimum interval between two payloads of the forecast's curves [s]."""
-CELLS_S = 60.0
+CELLS_INTERVAL_S = 60.0
 """Minimum interval between two comparisons of the cells [s]."""
 SOURCE_HUNG_S = 20.0
 """Time after which a source whose task has not run counts as hung [s]. A missing port is retried at least every 10 s."""
@@ -60,7 +60,7 @@ class Publisher:
         sinks: Destinations of the snapshots.
         clock: The clocks.
         status: State of the service around the pack.
-        totals: Totals over restarts; default: new totals.
+        totals: Lifetime totals; default: new totals.
         on_alarm: Called with each alarm that is raised or cleared.
 
     Attributes:
@@ -89,22 +89,22 @@ class Publisher:
         self._rest = RestDetector(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
         self._latency = Latency()
-        self._forecast_s = -math.inf  # time of the last payload of the curves
+        self._forecast_sent_s = -math.inf  # time of the last payload of the curves
         self._no_forecast = no_forecast(cell.no_forecast_reason)
         self._device_soc: float | None = None  # SOC that the device reported last
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
-        self._cells_s = -math.inf  # time of the last comparison of the cells, monotonic clock
+        self._cells_sent_s = -math.inf  # time of the last comparison of the cells, monotonic clock
         self.alarm_monitor = AlarmMonitor(settings, pack, source, clock, on_alarm, self._status.hooks)
         self._short_limit_a = short_limit_a(settings, cell)
         self._logged_faults = 0  # bits of ``InputFault``
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
-        self._sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
+        self._last_sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
-        self._dropped_before = self._dropped()  # number of dropped samples by kind before the present series of them
+        self._dropped_before = self._dropped()  # number of dropped samples by kind when the last sample was accepted
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -117,7 +117,7 @@ class Publisher:
 
     @property
     def wait_s(self) -> float:
-        """Return the time until a snapshot is overdue, which shows that no samples arrive [s]."""
+        """Time until a snapshot is overdue, which shows that no samples arrive [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
     def add(self, received: ReceivedSamples, step: Step, cells_fault: str = "") -> None:
@@ -132,17 +132,17 @@ class Publisher:
         self.add_to_alarms(received, step, cells_fault)
 
     def add_estimates(self, received: ReceivedSamples, step: Step) -> bool:
-        """Do the first part of ``add``. Return True if it has published a snapshot.
+        """Add the estimates without evaluating the alarms. Return True if a snapshot was published.
 
-        The alarms follow in ``add_to_alarms``, so that their evaluation does not delay the estimate. The first snapshot follows
-        there, too, because it lists the alarms that the first samples permit.
+        ``add_to_alarms`` evaluates the alarms later, so that they do not delay the estimate. It also publishes the first snapshot,
+        because this snapshot lists the alarms that the first samples permit.
         """
         if self._status.source_health:
             self._latency.add(self._status.source_health().block_age_s)
         now_s, trace = self._clock.monotonic(), step.trace
         if trace.size:
             self._window.add(trace, self._clock.wall(), received.cells_v, received.probes)
-            self._sample_s = now_s
+            self._last_sample_s = now_s
         self._device_soc = finite(received.device_soc[-1]) if received.device_soc.size else None
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
@@ -154,7 +154,7 @@ class Publisher:
         return True
 
     def add_to_alarms(self, received: ReceivedSamples, step: Step, cells_fault: str = "") -> None:
-        """Do the second part of ``add``, after ``add_estimates``."""
+        """Evaluate the alarms of the samples that were passed to ``add_estimates``."""
         now_s = self._clock.monotonic()
         alarm_changed = self.alarm_monitor.add(received, step, now_s, cells_fault)
         if not self.latest and now_s >= self._due_s:
@@ -192,13 +192,13 @@ class Publisher:
 
     def publish_last(self) -> None:
         """Publish a last snapshot with all payloads recomputed."""
-        self._slow_s = self._forecast_s = self._cells_s = -math.inf
+        self._slow_sent_s = self._forecast_sent_s = self._cells_sent_s = -math.inf
         self.publish()
 
     @property
     def alive(self) -> bool:
         """True while samples arrive or the task of the source runs."""
-        fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
+        fresh = self._clock.monotonic() - self._last_sample_s <= self._fresh_s
         health = self._status.source_health
         return fresh or health is None or health().task_idle_s <= SOURCE_HUNG_S
 
@@ -216,7 +216,7 @@ class Publisher:
         return self.snapshot.health.sensor_message or self._rest.not_at_rest_reason(self._clock.monotonic())
 
     def _first_snapshot(self) -> Snapshot:
-        now_s = self._slow_s = self._started_s
+        now_s = self._slow_sent_s = self._started_s
         parameters = make_parameters_payload(self._estimator, self._started_wall_s)
         return Snapshot(
             None,
@@ -231,18 +231,18 @@ class Publisher:
         _, parameters, health, info, _, forecast, cells = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
         estimate = self._estimate(summary, wall_s) if summary else None
-        if summary and now_s - self._forecast_s >= FORECAST_S:
-            self._forecast_s, forecast = now_s, self._forecast(summary, wall_s)
+        if summary and now_s - self._forecast_sent_s >= FORECAST_INTERVAL_S:
+            self._forecast_sent_s, forecast = now_s, self._forecast(summary, wall_s)
         message = self._sensor_message(now_s)
-        slow_due = now_s - self._slow_s >= SLOW_S
+        slow_due = now_s - self._slow_sent_s >= SLOW_INTERVAL_S
         if slow_due:
-            self._slow_s = now_s
+            self._slow_sent_s = now_s
             parameters, info = make_parameters_payload(self._estimator, wall_s), self._info()
         if slow_due or health.sensor_online != (message is None):
             health = self._health(now_s, message)
             self._log_input_faults(health)
-        if now_s - self._cells_s >= CELLS_S and self._deviations is not None:
-            self._cells_s, cells = now_s, make_cells_payload(self._deviations, self._short_limit_a, wall_s)
+        if now_s - self._cells_sent_s >= CELLS_INTERVAL_S and self._deviations is not None:
+            self._cells_sent_s, cells = now_s, make_cells_payload(self._deviations, self._short_limit_a, wall_s)
         return Snapshot(estimate, parameters, health, info, self.alarm_monitor.report, forecast, cells)
 
     @property
@@ -250,7 +250,7 @@ class Publisher:
         return self._pack.cells.deviations if self._pack.cells else None
 
     def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
-        # only saved values, so that the next run continues from there
+        # only saved values are published, so that the next run continues from the published ones
         self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
         capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
@@ -303,7 +303,7 @@ class Publisher:
             log.warning("suspected input faults", suspects=health.suspects or "none")
 
     def _loop(self) -> LoopHealth:
-        p50_s, p99_s, max_s = self._latency.take() or (None, None, None)
+        p50_s, p99_s, max_s = self._latency.pop_summary() or (None, None, None)
         status = self._status
         return LoopHealth(
             latency_p50_s=p50_s,
@@ -324,7 +324,7 @@ class Publisher:
 
     def _sensor_message(self, now_s: float) -> str | None:
         """Return the reason why no fresh values arrive; None when they do."""
-        silent_s = now_s - self._sample_s
+        silent_s = now_s - self._last_sample_s
         if silent_s <= self._fresh_s:
             return None
         if self._source.silence_reason:
