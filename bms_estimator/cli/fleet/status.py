@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bms_estimator.fleet.heartbeat import Heartbeat
     from bms_estimator.fleet.nats.dead_packs import DeadPacks
 
-STREAMS_S = 10.0
+STREAMS_TIMEOUT_S = 10.0
 """Timeout of the requests to the streams [s]."""
 MIN_CLOCKS = 2
 """Number of packs of a worker above which errors of most clocks prove that the server's clock is wrong."""
@@ -54,7 +54,6 @@ def status(
 
 
 def _refusals(heartbeat: "Heartbeat") -> list[str]:
-    """Return a line for each partition that a worker refuses."""
     return [
         f"partition {each.partition}: {heartbeat.id} refuses it, because its checkpoint is of format "
         f"{each.format or 'unknown'}: start a worker of the version that wrote it"
@@ -133,7 +132,7 @@ async def _stream_lines(address: ServerAddress) -> list[str]:
 
     async with connected(*address) as nc:
         try:
-            async with asyncio.timeout(STREAMS_S):
+            async with asyncio.timeout(STREAMS_TIMEOUT_S):
                 partitions = await partitions_of(nc)
                 if partitions is None:
                     return ["the server has no streams yet: was `fleet serve` started?"]
