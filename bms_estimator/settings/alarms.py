@@ -226,7 +226,7 @@ class AlarmSettings(Strict):
     )
 
     @model_validator(mode="after")
-    def _only_one_relay_hook(self) -> Self:
+    def _check_relay_hooks(self) -> Self:
         if sum(hook.relay is not None for hook in self.hook) > 1:
             raise ValueError("hook: the board has one relay; give one hook with all its alarms")
         return self

@@ -78,7 +78,7 @@ class PackValues(Strict):
     )
 
     @model_validator(mode="after")
-    def _full_above_cutoff(self) -> Self:
+    def _check_full_above_cutoff(self) -> Self:
         full_v, cutoff_v = self.full_voltage_v, self.cutoff_voltage_v
         if full_v is not None and cutoff_v is not None and full_v <= cutoff_v:
             raise ValueError(f"full_voltage_v = {full_v:g}: must be above cutoff_voltage_v = {cutoff_v:g}")

@@ -119,7 +119,7 @@ class CanSource(BaseSource):
     )
     soc: Signal | None = Field(
         default=None,
-        description="signal of the SOC by the BMS [%], written like voltage; it is shown beside the estimate",
+        description="signal of the SOC that the BMS reports [%], written like voltage; it is shown beside the estimate",
     )
     cells: tuple[CellSignals, ...] = Field(
         default=(),
