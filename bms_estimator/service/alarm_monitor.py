@@ -95,7 +95,7 @@ class AlarmMonitor:
                 probes=received.probes,
                 cells_fault=cells_fault,
                 clock_fault=self._source.clock_fault,
-                lost=self._lost,
+                lost=self._lost_samples,
                 cell_alarm_inputs=cell_alarm_inputs(cells) if cells is not None and is_new else None,
                 weak_cell_std=slow_fit.weak_cell_std if slow_fit else math.nan,
             )
@@ -173,7 +173,7 @@ class AlarmMonitor:
 
     def raise_state_lost(self, reason: str) -> None:
         """Raise ``alarm_state_lost``, and pass it to the callback."""
-        self.alarms.raise_state_lost(reason, self._clock.wall(), self._measured)
+        self.alarms.raise_state_lost(reason, self._clock.wall(), self._measured_counts)
         self._report_changes()
 
     def _evaluate_silence(self, now_s: float) -> None:
@@ -181,7 +181,7 @@ class AlarmMonitor:
         self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), reason, now_s)
 
     @property
-    def _measured(self) -> dict[Quantity, int]:
+    def _measured_counts(self) -> dict[Quantity, int]:
         """Number of values in a sample by quantity, for the quantities that the estimators have received."""
         if not self._estimator.state["started"][0]:
             return {}
@@ -193,7 +193,7 @@ class AlarmMonitor:
         return measured
 
     @property
-    def _lost(self) -> int:
+    def _lost_samples(self) -> int:
         """Number of samples that were lost on the line.
 
         The larger of lost frames and errors counts, because a damaged frame is also missing in the sequence of frames.

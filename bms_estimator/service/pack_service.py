@@ -199,14 +199,14 @@ async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None
     _require_unique("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
     _require_unique("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
     for settings, cell in packs:  # before any service starts
-        with _error_of_pack(settings):
+        with _prefixed_errors(settings):
             monitored_alarms(settings, cell)
     stop, notifier, pages = stop_on_signal(), SystemdNotifier(names), Pages()
 
     async def run_one(settings: Settings, cell: PackModel) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
-            with _error_of_pack(settings):
+            with _prefixed_errors(settings):
                 folder = state_folder(settings)
                 await run_pack_service(settings, cell, stop=stop, folder=folder, notifier=notifier, pages=pages)
         finally:
@@ -219,7 +219,7 @@ async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None
 
 
 @contextlib.contextmanager
-def _error_of_pack(settings: Settings) -> Iterator[None]:
+def _prefixed_errors(settings: Settings) -> Iterator[None]:
     """Prefix the text of a UserError with the pack's name."""
     try:
         yield

@@ -104,7 +104,9 @@ class Publisher:
         self._due_s = self._started_s
         self._last_sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
-        self._dropped_before = self._dropped()  # number of dropped samples by kind when the last sample was accepted
+        self._dropped_before = (
+            self._dropped_counts()
+        )  # number of dropped samples by kind when the last sample was accepted
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -147,7 +149,7 @@ class Publisher:
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
         elif self._drop_reason is not None:
-            self._drop_reason, self._dropped_before = None, self._dropped()
+            self._drop_reason, self._dropped_before = None, self._dropped_counts()
         if now_s < self._due_s or not self.latest:
             return False
         self._publish_snapshot(now_s)
@@ -221,8 +223,8 @@ class Publisher:
         return Snapshot(
             None,
             parameters,
-            self._health(now_s, self._sensor_message(now_s)),
-            self._info(),
+            self._make_health(now_s, self._sensor_message(now_s)),
+            self._make_info(),
             self.alarm_monitor.report,
         )
 
@@ -230,16 +232,16 @@ class Publisher:
         """Return a snapshot with the estimate of this window. Other payloads are recomputed only when they are due."""
         _, parameters, health, info, _, forecast, cells = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
-        estimate = self._estimate(summary, wall_s) if summary else None
+        estimate = self._make_estimate(summary, wall_s) if summary else None
         if summary and now_s - self._forecast_sent_s >= FORECAST_INTERVAL_S:
-            self._forecast_sent_s, forecast = now_s, self._forecast(summary, wall_s)
+            self._forecast_sent_s, forecast = now_s, self._make_forecast(summary, wall_s)
         message = self._sensor_message(now_s)
         slow_due = now_s - self._slow_sent_s >= SLOW_INTERVAL_S
         if slow_due:
             self._slow_sent_s = now_s
-            parameters, info = make_parameters_payload(self._estimator, wall_s), self._info()
+            parameters, info = make_parameters_payload(self._estimator, wall_s), self._make_info()
         if slow_due or health.sensor_online != (message is None):
-            health = self._health(now_s, message)
+            health = self._make_health(now_s, message)
             self._log_input_faults(health)
         if now_s - self._cells_sent_s >= CELLS_INTERVAL_S and self._deviations is not None:
             self._cells_sent_s, cells = now_s, make_cells_payload(self._deviations, self._short_limit_a, wall_s)
@@ -249,7 +251,7 @@ class Publisher:
     def _deviations(self) -> CellDeviations | None:
         return self._pack.cells.deviations if self._pack.cells else None
 
-    def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
+    def _make_estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         # only saved values are published, so that the next run continues from the published ones
         self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
         capacity_ah = self._cell.capacity_ah
@@ -268,11 +270,11 @@ class Publisher:
             self._device_soc,
         )
 
-    def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:
+    def _make_forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:
         forecaster = self._pack.forecaster
         return make_forecast_payload(forecaster.latest, forecaster.cutoff_v, window, wall_s) if forecaster else None
 
-    def _health(self, now_s: float, message: str | None) -> Health:
+    def _make_health(self, now_s: float, message: str | None) -> Health:
         lag_s, self._lag_s, status, slow_fit = self._lag_s, 0.0, self._status, self._pack.slow_fit
         return make_health_payload(
             self._estimator.record[0],
@@ -288,7 +290,7 @@ class Publisher:
             clock_ppm=self._source.clock_ppm,
             total=self._totals.total,
             unseen_s=self._totals.unseen_s,
-            loop=self._loop(),
+            loop=self._loop_health(),
             recording=status.recording(),
             edge=status.edge(),
             hooks=status.hooks(),
@@ -302,7 +304,7 @@ class Publisher:
             self._logged_faults = suspects
             log.warning("suspected input faults", suspects=health.suspects or "none")
 
-    def _loop(self) -> LoopHealth:
+    def _loop_health(self) -> LoopHealth:
         p50_s, p99_s, max_s = self._latency.pop_summary() or (None, None, None)
         status = self._status
         return LoopHealth(
@@ -315,7 +317,7 @@ class Publisher:
             disk_free_mib=status.disk_free_mib,
         )
 
-    def _info(self) -> Info:
+    def _make_info(self) -> Info:
         self._board = self._source.board or self._board  # properties of an unplugged board remain
         sensed = bool(self._estimator.record["filter"]["sensed"][0])
         return make_info_payload(
@@ -331,12 +333,12 @@ class Publisher:
             return self._source.silence_reason
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
-        dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped().items()}
+        dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped_counts().items()}
         text = f"no usable sample for {silent_s:.1f} s"
         text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
         return f"{text}; {self._drop_reason}" if self._drop_reason else text
 
-    def _dropped(self) -> dict[str, int]:
+    def _dropped_counts(self) -> dict[str, int]:
         """Return the dropped samples by kind."""
         counted = sample_counters(self._estimator.state[0]).items()
         return {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}

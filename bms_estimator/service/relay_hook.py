@@ -58,13 +58,13 @@ class RelayHold:
         """
         resets, self.boots = boots - self.boots, boots
         if resets:
-            self._start(resets, now_s)
+            self._start_hold(resets, now_s)
             self._proven_s = now_s + max(self.hold_s, FIRST_HOLD_S)
         return resets
 
     def resume(self, now_s: float) -> None:
         """Start a hold as after a reset, because the relay may have failed before the restart of the service."""
-        self._start(1, now_s)
+        self._start_hold(1, now_s)
 
     def end(self) -> None:
         """End the hold, because an alarm was raised. If low is the safe level, the hold remains: it permits the low level."""
@@ -81,7 +81,7 @@ class RelayHold:
         """Return True if the commands after the last reset have held long enough."""
         return now_s >= self._proven_s
 
-    def _start(self, resets: int, now_s: float) -> None:
+    def _start_hold(self, resets: int, now_s: float) -> None:
         if now_s - self._reset_s >= QUIET_S:
             self.resets = 0
         self.resets += resets

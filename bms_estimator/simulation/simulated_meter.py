@@ -134,10 +134,10 @@ class SimulatedVeDirect(SimulatedMeter):
             "FW": "0416",
             "MON": "0",
         }
-        return _block(fields) + _block({"H1": "0", "H2": "0", "H3": "0", "H4": "0"})
+        return _vedirect_block(fields) + _vedirect_block({"H1": "0", "H2": "0", "H3": "0", "H4": "0"})
 
 
-def _block(fields: Mapping[str, str]) -> bytes:
+def _vedirect_block(fields: Mapping[str, str]) -> bytes:
     body = "".join(f"\r\n{label}\t{value}" for label, value in fields.items()).encode() + b"\r\nChecksum\t"
     return body + bytes((-sum(body) & 0xFF,))  # the sum of all bytes of a block is 0 modulo 256
 

@@ -280,16 +280,16 @@ class VirtualBoard:
         self._clock_ns += self._period_ns
         self.samples += 1
         self._apply_relay_fallback()
-        message = self._message(reading)
+        message = self._sample_message(reading)
         self._sequence = (self._sequence + 1) % MODULUS
         if len(self._unsent) > _MAX_UNSENT_BYTES and not math.isinf(self.speed):
             self._overrun = True
             return True
         self._overrun = False
-        self._unsent += self._text(message, reading) if self._mode == "text" else self._frame(message)
+        self._unsent += self._text_line(message, reading) if self._mode == "text" else self._frame_with_fault(message)
         return True
 
-    def _message(self, reading: Reading) -> SampleMessage:
+    def _sample_message(self, reading: Reading) -> SampleMessage:
         sums = self._converter.window(reading, self._pair_count)
         status = BoardStatus.AUX_IS_NTC * self._aux_is_ntc + (self._reset_cause << 4)  # the upper half is the cause
         status |= BoardStatus.VOLTAGE_SATURATED * sums.voltage_saturated
@@ -301,7 +301,7 @@ class VirtualBoard:
         board_us = self._clock_ns // 1000 % MODULUS
         return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, n, int(status))
 
-    def _text(self, message: SampleMessage, reading: Reading) -> bytes:
+    def _text_line(self, message: SampleMessage, reading: Reading) -> bytes:
         """Return the line that a simple Arduino sketch would print."""
         parts = self._converter.parts
         volts_per_step = parts.supply_v / FULL_SCALE / message.count
@@ -312,7 +312,7 @@ class VirtualBoard:
             return b"%.3f,%.3f\r\n" % (voltage_v, current_a)
         return b"%.3f,%.3f,%.1f\r\n" % (voltage_v, current_a, reading.temperature_c)
 
-    def _frame(self, message: SampleMessage) -> bytes:
+    def _frame_with_fault(self, message: SampleMessage) -> bytes:
         """Return the bytes of a sample, changed by the next fault if there is one."""
         frame, delayed, self._delayed_frame = message.encode(), self._delayed_frame, b""
         if not self._faults:
