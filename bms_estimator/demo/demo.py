@@ -93,7 +93,7 @@ class DemoBroker:
 
     async def _start(self, folder: Path, stack: contextlib.AsyncExitStack) -> None:
         config, log = folder / "nats.conf", folder / "log"
-        config.write_text(_configuration(folder / "streams", self.port))
+        config.write_text(_server_config(folder / "streams", self.port))
         process = await asyncio.create_subprocess_exec(
             *(self._server, "-c", config, "-l", log, "--ports_file_dir", folder),
             preexec_fn=terminate_with_parent(),
@@ -102,14 +102,14 @@ class DemoBroker:
         stack.push_async_callback(_terminate, process)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(START_TIMEOUT_S):
-                while not _listens(folder) and process.returncode is None:  # noqa: ASYNC110 - the server reports its start only by a file
+                while not _is_listening(folder) and process.returncode is None:  # noqa: ASYNC110 - the server reports its start only by a file
                     await asyncio.sleep(POLL_S)
-        if not _listens(folder):
+        if not _is_listening(folder):
             reason = log.read_text(errors="replace").strip() if log.exists() else ""
             raise UserError(f"the demo's broker {self._server} does not start: {reason or 'it wrote no log'}")
 
 
-def _listens(folder: Path) -> bool:
+def _is_listening(folder: Path) -> bool:
     """Return True once the server has written its ports file, which it does when it listens on all ports."""
     return any(folder.glob("*.ports"))
 
@@ -120,7 +120,7 @@ async def _terminate(process: asyncio.subprocess.Process) -> None:
     await process.wait()
 
 
-def _configuration(folder: Path, mqtt_port: int) -> str:
+def _server_config(folder: Path, mqtt_port: int) -> str:
     """Return the server's settings. Its port for NATS clients is unused. The port number -1 selects any free port."""
     return f"""
 server_name: demo

@@ -29,10 +29,10 @@ def check_port(subject: Subject) -> Iterator[Finding]:
     except NoPortError as error:
         yield fault(NAME, str(error), "connect the device, or set sensor.port to one of: bms-estimator ports")
         return
-    yield _permission(subject, port)
+    yield _permission_finding(subject, port)
     usb_ports = {os.path.realpath(each.device) for each in named_ports().values() if each.vid is not None}
     if os.path.realpath(port) in usb_ports:
-        yield _udev_rule(subject)
+        yield _udev_rule_finding(subject)
 
 
 def may_open(status: os.stat_result, user: int, groups: Collection[int]) -> bool:
@@ -54,7 +54,7 @@ def may_open(status: os.stat_result, user: int, groups: Collection[int]) -> bool
     return status.st_mode & needed == needed
 
 
-def _permission(subject: Subject, port: str) -> Finding:
+def _permission_finding(subject: Subject, port: str) -> Finding:
     """Return the finding on the permission of this user to open the port; as root, of the systemd unit's user."""
     status = Path(port).stat()
     owner = f"{_user_name(status.st_uid)}:{_group_name(status.st_gid)} {stat.filemode(status.st_mode)}"
@@ -81,7 +81,7 @@ def _groups_of_service() -> set[int]:
         return set()
 
 
-def _udev_rule(subject: Subject) -> Finding:
+def _udev_rule_finding(subject: Subject) -> Finding:
     """Return the finding on the udev rule. The rule names boards by their USB port, and excludes them from ModemManager."""
     for folder in RULE_FOLDERS:
         if (folder / paths.UDEV_RULE.name).exists():

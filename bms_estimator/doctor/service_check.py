@@ -22,7 +22,7 @@ def check_service(subject: Subject) -> Iterator[Finding]:
             text = f"does not run, and no systemd unit runs {subject.path}"
             yield warning(NAME, text, f"{subject.install_command}; or: bms-estimator run {subject.path}")
         return
-    yield describe_unit(unit)
+    yield unit_finding(unit)
     if not has_memory_groups():
         text = f"the kernel limits no memory: MemoryMax of {unit.name} has no effect"
         yield warning(
@@ -33,7 +33,7 @@ def check_service(subject: Subject) -> Iterator[Finding]:
         yield warning(NAME, text, f"sudo systemctl enable {unit.name}")
 
 
-def describe_unit(unit: SystemdUnit) -> Finding:
+def unit_finding(unit: SystemdUnit) -> Finding:
     """Return the finding on the state of a systemd unit, and on the end of its last run."""
     restarts = f", {unit.restarts} restarts" if unit.restarts else ""
     journal = f"journalctl -u {unit.name} -n 20"
@@ -41,16 +41,16 @@ def describe_unit(unit: SystemdUnit) -> Finding:
         status = f"; {unit.status_text}" if unit.status_text else ""
         return ok(NAME, f"{unit.name}: runs{restarts}{status}")
     if unit.active_state in ("activating", "reloading"):
-        text = f"{unit.name}: is starting{restarts}; the last run ended with {_ending(unit)}"
+        text = f"{unit.name}: is starting{restarts}; the last run ended with {_outcome_text(unit)}"
         return warning(NAME, text, f"the reason is in its log: {journal}")
     if unit.result == "success" and unit.exit_status == 0:
         return fault(NAME, f"{unit.name}: is stopped", f"sudo systemctl start {unit.name}")
     if unit.exit_status == INVALID_SETTING:
         return fault(NAME, f"{unit.name}: ended because of an invalid setting", f"the setting is in its log: {journal}")
-    return fault(NAME, f"{unit.name}: ended with {_ending(unit)}", f"the reason is in its log: {journal}")
+    return fault(NAME, f"{unit.name}: ended with {_outcome_text(unit)}", f"the reason is in its log: {journal}")
 
 
-def _ending(unit: SystemdUnit) -> str:
+def _outcome_text(unit: SystemdUnit) -> str:
     """Return the outcome of a unit's last run as text."""
     if unit.exit_status == os.EX_TEMPFAIL:
         return f"a fault of the environment, such as a missing folder or file, or another process (status {unit.exit_status})"

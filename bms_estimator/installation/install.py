@@ -134,7 +134,7 @@ def compile_ahead(program: Path) -> None:
     )
 
 
-def start() -> None:
+def start_service() -> None:
     """Start or restart the service of this machine, and restart the running units of other packs.
 
     Raises:
@@ -150,7 +150,7 @@ def start() -> None:
         ) from None
 
 
-def restart_running() -> None:
+def restart_running_units() -> None:
     """Restart the running units, so that they run the upgraded program. Units that do not run are not started."""
     run(["systemctl", "try-restart", paths.UNIT.name, OTHER_PACKS])
 

@@ -71,12 +71,12 @@ class Connections:
     def __init__(self, limit: int | None = None) -> None:
         self.limit = limit or _default_limit()
         self._address_limit = max(1, int(ADDRESS_FRACTION * self.limit))
-        self._open: dict[asyncio.BaseTransport, _Connection] = {}
+        self._by_transport: dict[asyncio.BaseTransport, _Connection] = {}
 
     def __len__(self) -> int:
         """Return the number of open connections."""
         self._prune()
-        return len(self._open)
+        return len(self._by_transport)
 
     def add(self, client_socket: socket.socket, transport: asyncio.Transport, address: str) -> None:
         """Add a connection and start the deadline of its first request; close it if the limits do not allow it."""
@@ -84,12 +84,12 @@ class Connections:
             transport.abort()
             return
         deadline = asyncio.get_running_loop().call_later(HEADER_TIMEOUT_S, transport.abort)
-        self._open[transport] = _Connection(client_socket, transport, address, deadline)
+        self._by_transport[transport] = _Connection(client_socket, transport, address, deadline)
 
     @contextlib.contextmanager
     def serving(self, transport: asyncio.BaseTransport | None) -> Iterator[None]:
         """Exempt a connection from deadline and displacement while its request is handled."""
-        connection = self._open.get(transport) if transport else None
+        connection = self._by_transport.get(transport) if transport else None
         if connection is None:
             yield
             return
@@ -117,10 +117,10 @@ class Connections:
     def _make_room(self, address: str) -> bool:
         """Return True if an address may have one more connection; close an idle one if necessary."""
         self._prune()
-        own = [each for each in self._open.values() if each.address == address]
+        own = [each for each in self._by_transport.values() if each.address == address]
         if len(own) >= self._address_limit:
             return self._displace(own)
-        return len(self._open) < self.limit or self._displace(list(self._open.values()))
+        return len(self._by_transport) < self.limit or self._displace(list(self._by_transport.values()))
 
     def _displace(self, candidates: list[_Connection]) -> bool:
         idle = next((each for each in candidates if not each.is_busy), None)
@@ -132,13 +132,13 @@ class Connections:
 
     def _prune(self) -> None:
         """Remove the connections whose descriptor is closed."""
-        for each in list(self._open.values()):
+        for each in list(self._by_transport.values()):
             if each.client_socket.fileno() < 0:
                 self._drop(each)
 
     def _drop(self, connection: _Connection) -> None:
         connection.deadline.cancel()
-        del self._open[connection.transport]
+        del self._by_transport[connection.transport]
 
 
 CONNECTIONS = Connections()

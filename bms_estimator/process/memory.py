@@ -42,12 +42,12 @@ def _available_in_groups() -> Iterator[int]:
     for line in Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines():
         _, controllers, path = line.split(":", 2)
         if controllers == "":
-            yield from _available_below(CGROUPS, path, "memory.max", "anon")
+            yield from _available_in_parents(CGROUPS, path, "memory.max", "anon")
         elif "memory" in controllers.split(","):
-            yield from _available_below(CGROUPS / "memory", path, "memory.limit_in_bytes", "total_rss")
+            yield from _available_in_parents(CGROUPS / "memory", path, "memory.limit_in_bytes", "total_rss")
 
 
-def _available_below(root: Path, path: str, limit_file: str, used: str) -> Iterator[int]:
+def _available_in_parents(root: Path, path: str, limit_file: str, used: str) -> Iterator[int]:
     """Yield limit less use of the group ``path`` and of each of its parents that has a limit [bytes]."""
     group = root / path.lstrip("/")
     for folder in (group, *group.parents):

@@ -45,7 +45,7 @@ def _acknowledge_all() -> None:
 
 
 @contextlib.contextmanager
-def startup_signals() -> Iterator[None]:
+def exit_on_startup_signals() -> Iterator[None]:
     """Exit with code 0 on SIGTERM or SIGHUP until an event loop handles them. There is no state to save yet.
 
     An ignored SIGHUP stays ignored, as under nohup.

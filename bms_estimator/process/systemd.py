@@ -29,7 +29,7 @@ class SystemdNotifier:
         self, packs: Collection[str], environment: Mapping[str, str] = os.environ, *, activity: str = "estimating"
     ) -> None:
         self._packs, self._activity = frozenset(packs), activity
-        self._awaited: dict[str, set[str]] = {}
+        self._awaited: dict[str, set[str]] = {}  # packs that have yet to report, by state
         self._texts = dict.fromkeys(packs, "")
         self._socket = environment.get("NOTIFY_SOCKET", "")
         is_watched = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
@@ -81,7 +81,7 @@ def _send(address: str, state: str) -> None:
         channel.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
-def credential(name: Path) -> Path:
+def credential_path(name: Path) -> Path:
     """Return the path of this file name in ``$CREDENTIALS_DIRECTORY`` if it exists there, else ``name`` itself."""
     path = Path(os.environ.get("CREDENTIALS_DIRECTORY", ""), name)
     return path if os.access(path, os.R_OK) else name
@@ -93,4 +93,4 @@ def is_unreadable_credential(name: Path) -> bool:
     The service may be able to read it.
     """
     is_credential = not name.is_absolute() or name.is_relative_to(CREDENTIALS)
-    return is_credential and not os.access(credential(name), os.R_OK)
+    return is_credential and not os.access(credential_path(name), os.R_OK)

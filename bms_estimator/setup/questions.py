@@ -339,7 +339,7 @@ QUESTIONS = (
     Question(
         "device_soc_std",
         "How far may the SOC of the device be wrong [%]",
-        f"standard deviation of the SOC by the device, with which the estimate starts [%]; {NO_LIMIT}: it is not used",
+        f"standard deviation of the SOC that the device reports, from which the estimate starts [%]; {NO_LIMIT}: it is not used",
         _parse_device_soc_std,
         lambda answers: DEFAULT_DEVICE_SOC_STD if _reports_soc(answers) else NO_LIMIT,
         explanation="The estimate starts from this SOC, with the error that you give as its standard deviation.",

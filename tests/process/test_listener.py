@@ -83,7 +83,7 @@ async def test_a_client_is_disconnected_if_it_reads_nothing_of_its_response_with
     with connections.serving(transport):
         pass
     transport.write(bytes(8 << 20))  # more than the buffers of the sockets hold
-    (open_connection,) = connections._open.values()
+    (open_connection,) = connections._by_transport.values()
     connections._expire(open_connection)  # the first deadline only records the unsent bytes
     unsent = transport.get_write_buffer_size()
     async with asyncio.timeout(LONG_S):

@@ -44,7 +44,7 @@ MAX_BLOCK_S = 1.0
 
 @dataclass
 class RaisedAlarm:
-    """Alarm that was raised; times on the capture's clock [s]."""
+    """Alarm that was raised, with times on the capture's clock [s]."""
 
     alarm: str
     severity: str

@@ -153,7 +153,7 @@ async def _replay(
     settings: Settings, model: PackModel, source: Replay, table: TableSink | None, *, fit_pack: bool
 ) -> ReplayResult:
     """Run the estimator over a source, and pass the estimates to table, summary and broker."""
-    errors: dict[str, str] = {}  # the last text of each kind
+    errors: dict[str, str] = {}  # last error text of each kind of failed fit
     if not fit_pack:
         identifier = settings.identifier.model_copy(update={"pack_model": False})
         settings = settings.model_copy(update={"identifier": identifier})
@@ -266,7 +266,7 @@ def result_table(title: str, result: ReplayResult) -> Table:
         "samples": f"{result.samples:,}",
         "dropped": _dropped_text(result),
         **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
-        **({"clock set back": _set_back_text(result)} if result.time_steps_back else {}),
+        **({"clock set back": _clock_steps_text(result)} if result.time_steps_back else {}),
         "duration": _number_text(result.duration_s, ",.1f", "s"),
         **(_soc_rows(result) if has_soc else {}),
         "innovation, RMS": _number_text(result.innovation_rms_v, ".3f", "mV", 1e3),
@@ -337,7 +337,7 @@ def _temperature_row(result: ReplayResult) -> dict[str, str]:
     return {"temperature": dropped} if result.temperatures_dropped else {}
 
 
-def _set_back_text(result: ReplayResult) -> str:
+def _clock_steps_text(result: ReplayResult) -> str:
     """Return the number of backward steps of the clock, with the likely cause if there are many."""
     text = f"{result.time_steps_back:,} times"
     is_frequent = result.time_steps_back > RARE_FAULT_FRACTION * result.samples

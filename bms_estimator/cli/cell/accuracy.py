@@ -81,7 +81,7 @@ def accuracy(
         window = Window(0.0, has_temperature=False)
     else:
         compile_ahead()
-        window, present_std, full_charges = _use_of_pack(settings, model)
+        window, present_std, full_charges = _window_of_pack(settings, model)
     if between is not None:
         window = _with_ends(window, *between)
     elif window.high - window.low < MIN_WINDOW:
@@ -109,7 +109,7 @@ def _with_ends(window: Window, low: float, high: float) -> Window:
     return replace(window, low=low / 100.0, high=high / 100.0, full=high == 100.0, charge_seen=True)
 
 
-def _use_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, int]:
+def _window_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, int]:
     """Return the window of a pack's history, the std of its SOC, and its number of full charges.
 
     Without a history the window is empty.

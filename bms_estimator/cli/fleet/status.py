@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.table import counted, print_table
+from bms_estimator.cli.options.table import count_text, print_table
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def _unknown_packs(heartbeat: "Heartbeat") -> list[str]:
         for pack in heartbeat.unknown
     ]
     more = heartbeat.unknown_count - len(lines)
-    return [*lines, f"{heartbeat.id}: {counted(more, 'more unknown pack')}"] if more > 0 else lines
+    return [*lines, f"{heartbeat.id}: {count_text(more, 'more unknown pack')}"] if more > 0 else lines
 
 
 def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
@@ -78,13 +78,13 @@ def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
         f"{pack}: dead letter: {reason}; `fleet dead-letters list` lists all" for pack, reason in dead_packs.reasons
     ]
     more = dead_packs.packs - len(lines)
-    return [*lines, f"{counted(more, 'more pack')} with dead letters"] if more else lines
+    return [*lines, f"{count_text(more, 'more pack')} with dead letters"] if more else lines
 
 
 def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
     """Return a line for each listed pack whose edge's clock is wrong, the largest error first."""
     if 2 * heartbeat.clock_error_count > heartbeat.packs > MIN_CLOCKS:
-        clocks = counted(heartbeat.clock_error_count, "edge")
+        clocks = count_text(heartbeat.clock_error_count, "edge")
         return [
             f"{heartbeat.id}: the clocks of {clocks} of {heartbeat.packs} differ from the server's: check the clocks of its nodes"
         ]
@@ -95,7 +95,7 @@ def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
         for pack, error_s in largest
     ]
     more = heartbeat.clock_error_count - len(largest)
-    return [*lines, f"{heartbeat.id}: {counted(more, 'more pack')} with a wrong clock"] if more > 0 else lines
+    return [*lines, f"{heartbeat.id}: {count_text(more, 'more pack')} with a wrong clock"] if more > 0 else lines
 
 
 def _row(heartbeat: "Heartbeat") -> tuple[object, ...]:

@@ -16,7 +16,7 @@ from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.process.log_setup import configure_logs, flush_logs, set_level
-from bms_estimator.process.signals import startup_signals, stop_on_signal
+from bms_estimator.process.signals import exit_on_startup_signals, stop_on_signal
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
@@ -117,5 +117,5 @@ def edge(
     """
     settings = with_sensor(load_settings(pack), port=port)
     configure_logs()
-    with startup_signals(), flush_logs():
+    with exit_on_startup_signals(), flush_logs():
         asyncio.run(serve_edge(settings, state_folder(settings)))

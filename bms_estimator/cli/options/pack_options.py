@@ -31,7 +31,7 @@ def load_pack(path: Path) -> tuple[Settings, PackModel]:
         UserError: The file cannot be read, a setting is invalid, or the cell is unknown.
     """
     settings = load_settings(path)
-    return settings, _model(settings, _locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
+    return settings, _pack_model(settings, _locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
 def single_cell_of(path: Path, settings: Settings) -> CellModel:
@@ -59,7 +59,7 @@ def pack_or_cell(
         cell = _locate_cell(pack, settings.pack.cell)
     if capacity_ah is None:
         capacity_ah = settings.pack.capacity_ah
-    model = _model(settings, str(cell), capacity_ah)
+    model = _pack_model(settings, str(cell), capacity_ah)
     return with_pack(settings, cell=cell, capacity_ah=capacity_ah), model
 
 
@@ -80,7 +80,7 @@ def _locate_cell(pack: Path, cell: str) -> str:
     return str(cell_file) if cell_file.is_file() else cell
 
 
-def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
+def _pack_model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
     """Return the model of the whole pack, built from ``cell``."""
     model = load_model(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
     if settings.pack.initial_soc is not None:

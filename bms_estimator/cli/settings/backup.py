@@ -77,7 +77,7 @@ def restore(file: Archive, pack: Pack) -> None:
         with _user_errors(folder):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             for name, data in saved.items():
-                if not _pattern(settings.pack.name).fullmatch(name):
+                if not _state_file_pattern(settings.pack.name).fullmatch(name):
                     raise UserError(f"{file}: {name}: is not a file of the pack {settings.pack.name}")
                 write_private(folder / name, data)
             if not pack.exists():
@@ -98,11 +98,11 @@ def _state_files(pack: Path, settings: Settings) -> Iterator[tuple[Path, list[Pa
     folder = (paths.STATE if is_installed else state_folder_path(settings)).expanduser()
     with _user_errors(folder), instance_lock(folder, settings.pack.name):
         found = folder.iterdir() if folder.is_dir() else iter(())
-        pattern = _pattern(settings.pack.name)
+        pattern = _state_file_pattern(settings.pack.name)
         yield folder, sorted(each for each in found if each.is_file() and pattern.fullmatch(each.name))
 
 
-def _pattern(name: str) -> re.Pattern[str]:
+def _state_file_pattern(name: str) -> re.Pattern[str]:
     """Return the pattern of the names of the files of a pack's state.
 
     Another pack may be named ``NAME-0123abcd``, like a checkpoint of this pack. Its files have other suffixes.

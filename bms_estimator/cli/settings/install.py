@@ -10,7 +10,14 @@ from typing import Annotated
 import typer
 
 from bms_estimator.installation import paths
-from bms_estimator.installation.install import PackFiles, compile_ahead, install, restart_running, start, uninstall
+from bms_estimator.installation.install import (
+    PackFiles,
+    compile_ahead,
+    install,
+    restart_running_units,
+    start_service,
+    uninstall,
+)
 from bms_estimator.installation.machine import Machine
 from bms_estimator.installation.pack_files import is_hidden, named_files
 from bms_estimator.installation.program_copy import copy_program, is_program_copy, system_python
@@ -53,10 +60,10 @@ def install_command(
     if machine.has_running_systemd and not no_start:
         if may_start:
             compile_ahead(program)
-            start()
+            start_service()
             _report("service", "started")
         else:
-            restart_running()
+            restart_running_units()
     settings = machine.path(paths.PACK_FILE)
     if not settings.exists():
         typer.echo("\nThe service starts when it has settings:")
