@@ -34,7 +34,7 @@ from numba.core.serialize import dumps
 
 __all__ = [
     "CACHE_FOLDER",
-    "COMPILED_IN",
+    "COMPILED_SOURCES",
     "SHIPPED_FOLDER",
     "cache_folders",
     "njit",
@@ -54,7 +54,7 @@ _unliteral: Any = types.unliteral
 _rebuild: Any = CompileResultCacheImpl.rebuild
 _dumps: Any = dumps
 _PACKAGE = Path(__file__).parent
-COMPILED_IN = (
+COMPILED_SOURCES = (
     *sorted((_PACKAGE / "kernels").rglob("*.py")),
     *(
         _PACKAGE / file
@@ -114,9 +114,9 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Function], Functio
 
 
 def source_digest() -> str:
-    """Return the name of this version's folder in a cache folder: a hash of numba's version and the files in ``COMPILED_IN``."""
+    """Return the name of this version's folder in a cache folder: a hash of numba's version and the files in ``COMPILED_SOURCES``."""
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in COMPILED_IN:
+    for source in COMPILED_SOURCES:
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 
 from bms_estimator.doctor import device_check
-from bms_estimator.doctor.finding import Finding, Level, Subject, fault, ok, warning
+from bms_estimator.doctor.finding import ExaminedPack, Finding, Level, fault, ok, warning
 from bms_estimator.mqtt.broker_config import Broker, brokers
 from bms_estimator.mqtt.client import Timeouts
 from bms_estimator.mqtt.connection import BrokerConnectionError, Connection, ConnectOptions, LoginError, Message
@@ -31,7 +31,7 @@ ACCESS_LIST_REMEDY = "correct the broker's access list, for Mosquitto: deploy/mo
 """Remedy for a denied topic."""
 
 
-def check_broker(subject: Subject) -> Iterator[Finding]:
+def check_broker(subject: ExaminedPack) -> Iterator[Finding]:
     """Yield findings on the connection to brokers and fleet server, on denied topics, and on the health of a running service.
 
     Raises:
@@ -47,7 +47,7 @@ def check_broker(subject: Subject) -> Iterator[Finding]:
         yield from _check_section(subject, edge, None)
 
 
-def _check_section(subject: Subject, settings: BrokerSettings, pack_topic: str | None) -> Iterator[Finding]:
+def _check_section(subject: ExaminedPack, settings: BrokerSettings, pack_topic: str | None) -> Iterator[Finding]:
     """Yield the findings on the brokers of a section.
 
     Args:

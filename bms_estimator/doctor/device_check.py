@@ -11,7 +11,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from bms_estimator.doctor.finding import Finding, Subject, fault, ok, warning
+from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.protocols.registry import make_protocol
@@ -64,13 +64,13 @@ class FirstSample:
         return f"{self.voltage_v:.3f} V, {current}{f'; {names}' if names else ''}"
 
 
-def load_decoder(subject: Subject) -> None:
+def load_decoder(subject: ExaminedPack) -> None:
     """Load the kernel that decodes a board's frames. Without a cache it is compiled, which takes longer than a check's timeout."""
     if subject.settings.source is None and not subject.is_running:
         make_protocol(subject.settings.sensor).feed(0.0, b"\0\n")  # ends a frame, or a line of text
 
 
-def check_device(subject: Subject) -> Iterator[Finding]:
+def check_device(subject: ExaminedPack) -> Iterator[Finding]:
     """Yield findings on the samples of the device, and on the calibration and identity of a board."""
     source = subject.settings.source
     name = source.short_description if source else subject.settings.sensor.port
@@ -101,7 +101,7 @@ def check_device(subject: Subject) -> Iterator[Finding]:
         yield from check_board(subject, sample.board)
 
 
-def silence_remedy(subject: Subject) -> str:
+def silence_remedy(subject: ExaminedPack) -> str:
     """Return the remedy for a silent device."""
     return SERIAL_REMEDY if subject.settings.source is None else SOURCE_REMEDY
 
@@ -118,7 +118,7 @@ def _port_holder(port: str) -> str | None:
     return None if os.path.realpath(path).startswith(PSEUDO_TERMINALS) else holder(path)
 
 
-async def _first_sample(subject: Subject) -> FirstSample:
+async def _first_sample(subject: ExaminedPack) -> FirstSample:
     """Return the first sample of the pack's source.
 
     Raises:
@@ -143,7 +143,7 @@ async def _first_sample(subject: Subject) -> FirstSample:
         return sample
 
 
-def check_board(subject: Subject, board: Mapping[str, str]) -> Iterator[Finding]:
+def check_board(subject: ExaminedPack, board: Mapping[str, str]) -> Iterator[Finding]:
     """Yield findings on the calibration of a board, and on its identity.
 
     Args:

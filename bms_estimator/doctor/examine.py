@@ -14,7 +14,7 @@ from pathlib import Path
 
 from bms_estimator.doctor.broker_check import check_broker
 from bms_estimator.doctor.device_check import CELLS_TIMEOUT_S, FIRST_SAMPLE_TIMEOUT_S, check_device
-from bms_estimator.doctor.finding import Finding, Subject, fault, ok, warning
+from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
 from bms_estimator.doctor.kernel_check import check_kernels
 from bms_estimator.doctor.port_check import check_port
 from bms_estimator.doctor.service_check import check_service
@@ -74,7 +74,7 @@ def _run(check: Check) -> None:
 SETTINGS = "settings"
 
 
-def check_settings(subject: Subject) -> Iterator[Finding]:
+def check_settings(subject: ExaminedPack) -> Iterator[Finding]:
     """Yield a summary of the settings, and each likely mistake.
 
     Raises:
@@ -93,7 +93,7 @@ CHECKPOINTS_MB = 10.0
 """Size of checkpoints, temporary files and the queue of a short outage [MB]."""
 
 
-def check_disk(subject: Subject) -> Iterator[Finding]:
+def check_disk(subject: ExaminedPack) -> Iterator[Finding]:
     """Yield findings on the permissions of the state folder, and on the disk space for the history."""
     folder = subject.state_folder
     existing = _nearest_existing(folder)
@@ -143,7 +143,7 @@ REAL_TIME_CLOCK = Path("/dev/rtc0")
 """Clock with a battery."""
 
 
-def check_clock(subject: Subject | None) -> Iterator[Finding]:
+def check_clock(subject: ExaminedPack | None) -> Iterator[Finding]:
     """Yield findings on the synchronization of the clock, and on the service's access to its state."""
     hardware = "a clock with a battery" if REAL_TIME_CLOCK.exists() else "no clock with a battery"
     if is_clock_synchronized():
@@ -164,7 +164,7 @@ BROKER_TIMEOUT_S = 12.0
 """Timeout of the check of a broker: connection, subscription, retained messages and echo [s]."""
 
 
-def examine(subject: Subject | None) -> Iterator[Finding]:
+def examine(subject: ExaminedPack | None) -> Iterator[Finding]:
     """Run all checks at the same time, and yield their findings.
 
     Args:

@@ -22,7 +22,7 @@ ROOT_USER = 0
 
 
 @dataclass(frozen=True)
-class Subject:
+class ExaminedPack:
     """Pack that is examined, and its service."""
 
     path: Path

@@ -7,7 +7,7 @@ import stat
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from bms_estimator.doctor.finding import ROOT_USER, Finding, Subject, fault, is_root, ok, warning
+from bms_estimator.doctor.finding import ROOT_USER, ExaminedPack, Finding, fault, is_root, ok, warning
 from bms_estimator.installation import paths
 from bms_estimator.sources.serial.port_list import NoPortError, named_ports, resolve_port
 
@@ -20,7 +20,7 @@ NOBODY = 65534
 """User id without permissions. It represents the service's user, whose only permission is the group ``SERIAL_GROUP``."""
 
 
-def check_port(subject: Subject) -> Iterator[Finding]:
+def check_port(subject: ExaminedPack) -> Iterator[Finding]:
     """Yield findings on the existence and permissions of the serial port, and on the udev rule."""
     if subject.settings.source is not None:
         return
@@ -54,7 +54,7 @@ def may_open(status: os.stat_result, user: int, groups: Collection[int]) -> bool
     return status.st_mode & needed == needed
 
 
-def _permission_finding(subject: Subject, port: str) -> Finding:
+def _permission_finding(subject: ExaminedPack, port: str) -> Finding:
     """Return the finding on the permission of this user to open the port; as root, of the systemd unit's user."""
     status = Path(port).stat()
     owner = f"{_user_name(status.st_uid)}:{_group_name(status.st_gid)} {stat.filemode(status.st_mode)}"
@@ -81,7 +81,7 @@ def _groups_of_service() -> set[int]:
         return set()
 
 
-def _udev_rule_finding(subject: Subject) -> Finding:
+def _udev_rule_finding(subject: ExaminedPack) -> Finding:
     """Return the finding on the udev rule. The rule names boards by their USB port, and excludes them from ModemManager."""
     for folder in RULE_FOLDERS:
         if (folder / paths.UDEV_RULE.name).exists():

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator
 
-from bms_estimator.doctor.finding import Finding, Subject, fault, ok, warning
+from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
 from bms_estimator.doctor.systemd_unit import SystemdUnit
 from bms_estimator.process.memory import has_memory_groups
 
@@ -12,7 +12,7 @@ INVALID_SETTING = 2
 """Exit code of the service for an invalid setting, after which systemd does not restart it."""
 
 
-def check_service(subject: Subject) -> Iterator[Finding]:
+def check_service(subject: ExaminedPack) -> Iterator[Finding]:
     """Yield findings on the service of the pack and its systemd unit."""
     unit = subject.unit
     if unit is None:

@@ -60,7 +60,7 @@ def system_files(machine: Machine, program: Path) -> list[SystemFile]:
 
 UDEV_CONTROL = Path("/run/udev/control")
 """Socket of udev, which does not run in containers."""
-OTHER_PACKS = f"{paths.NAME}@*.service"
+OTHER_UNITS = f"{paths.NAME}@*.service"
 """Pattern of the units of other packs."""
 Report = Callable[[str, str], None]
 """Function that shows a finished step: its subject, and what was done."""
@@ -140,7 +140,7 @@ def start_service() -> None:
     Raises:
         UserError: The service does not start.
     """
-    run(["systemctl", "try-restart", OTHER_PACKS])
+    run(["systemctl", "try-restart", OTHER_UNITS])
     try:
         run(["systemctl", "restart", paths.UNIT.name])
     except UserError:
@@ -152,7 +152,7 @@ def start_service() -> None:
 
 def restart_running_units() -> None:
     """Restart the running units, so that they run the upgraded program. Units that do not run are not started."""
-    run(["systemctl", "try-restart", paths.UNIT.name, OTHER_PACKS])
+    run(["systemctl", "try-restart", paths.UNIT.name, OTHER_UNITS])
 
 
 def reload_system() -> None:
@@ -250,7 +250,7 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
     units = [unit for unit in all_units if machine.path(unit).exists()]
     if units:
         if machine.has_running_systemd:
-            run(["systemctl", "stop", paths.UNIT.name, OTHER_PACKS])
+            run(["systemctl", "stop", paths.UNIT.name, OTHER_UNITS])
         machine.run("systemctl", "disable", "--quiet", *(unit.name for unit in units))
         report("service", "stopped and disabled")
     drop_ins = [paths.drop_ins(unit) for unit in all_units]

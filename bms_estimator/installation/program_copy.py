@@ -125,7 +125,7 @@ def required_packages(program: Distribution, extras: Iterable[str]) -> list[Dist
 
 
 def _requirements(package: Distribution, extras: set[str]) -> Iterator[tuple[str, frozenset[str]]]:
-    """Yield name and extras of each requirement of a package that applies with the given extras of the package."""
+    """Yield name and extras of each requirement that a package has with the given extras."""
     for line in package.requires or []:
         requirement, _, marker = line.partition(";")
         extra = _EXTRA.search(marker)

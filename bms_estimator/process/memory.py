@@ -15,7 +15,7 @@ def anonymous_bytes() -> int:
 
 
 def available_bytes() -> int:
-    """Return the memory that programs can use without swapping, on the machine and in each control group of this process [bytes]."""
+    """Return the memory that this process can use without swapping, within the limits of machine and control groups [bytes]."""
     try:
         machine = _kib_of(Path("/proc/meminfo"), "MemAvailable") * 1024
     except FileNotFoundError:  # ProcSubset=pid of a systemd unit hides the file; half of the RAM counts as available

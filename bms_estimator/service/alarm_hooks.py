@@ -71,7 +71,7 @@ class AlarmHooks:
     def on_alarm_change(self, change: Change) -> None:
         """Pass a change of an alarm to its hooks; returns at once."""
         for hook in self._hooks:
-            if hook.covers(change.alarm.name):
+            if hook.applies_to(change.alarm.name):
                 hook.on_alarm_change(change.alarm)
 
     def stop_watching(self) -> None:
@@ -105,7 +105,7 @@ class AlarmHooks:
             is_unfinished = crashed or (finished is not None and _hash(hook.settings) not in finished)
             if failed or is_unfinished:
                 for alarm in raised:  # a finished hook does not announce hook_failed again
-                    if (is_unfinished or alarm not in failed) and hook.covers(alarm.name):
+                    if (is_unfinished or alarm not in failed) and hook.applies_to(alarm.name):
                         hook.on_alarm_change(alarm)
                 hook.restore_active(failed)
             else:

@@ -34,7 +34,7 @@ CHECK_INTERVAL_S = 1.0
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
 ALARM_SAVE_INTERVAL_S = 30.0
-"""Minimum interval before a save for an alarm that only ended, so that a flapping alarm does not wear the disk [s]. A kill
+"""Minimum interval between saves if alarms have only ended, so that a flapping alarm does not wear the disk [s]. A kill
 within this time raises the alarm again at the next start."""
 RETRY_S = 10.0
 """Interval between retries of a failed save of the alarms [s]."""

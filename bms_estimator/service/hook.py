@@ -45,7 +45,7 @@ class Hook(ABC):
         """True while a job is running or waiting."""
         return False
 
-    def covers(self, name: str) -> bool:
+    def applies_to(self, name: str) -> bool:
         """Return True if the hook is for this alarm: ``alarm_state_lost`` always, ``hook_failed`` only if listed."""
         if name == "alarm_state_lost":
             return True
@@ -68,7 +68,7 @@ class Hook(ABC):
 
     def restore_active(self, alarms: Iterable[Alarm]) -> None:
         """Restore raised alarms of an earlier run, on which the hook has acted."""
-        self._raised.update({alarm.name: alarm for alarm in alarms if self.covers(alarm.name)})
+        self._raised.update({alarm.name: alarm for alarm in alarms if self.applies_to(alarm.name)})
 
     def close(self) -> None:
         """Request that ``run`` returns after the waiting jobs."""

@@ -25,14 +25,14 @@ from bms_estimator.process.memory import anonymous_bytes, available_bytes
 from bms_estimator.process.systemd import extend_start
 
 ORDER_FILE = Path(__file__).with_name("compile_order.txt")
-"""File with the kernels of a first start, callees before callers: CPU time [s], name and types of the arguments.
+"""File with the kernels of a first start, callees before callers. A line has CPU time [s], name and argument types.
 ``make compile-order`` writes it."""
 MAX_CHILD_BYTES = 144 * 2**20
 """Anonymous memory above which a child ends [bytes]. One kernel adds at most 25 MiB."""
 CHILD_BYTES = 256 * 2**20
 """Available memory that is required for each child [bytes]."""
 MAX_FAILURES = 3
-"""Number of successive children without a compiled kernel after which compilation is given up, for example for lack of memory."""
+"""Number of successive children that compile no kernel, for example for lack of memory, after which the compilation fails."""
 REPORT_INTERVAL_S = 0.5
 """Interval between two reports of the progress [s]."""
 COMPLETE_FILE = f"complete-py{sys.version_info[0]}{sys.version_info[1]}-{os.uname().machine}"

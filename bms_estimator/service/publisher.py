@@ -12,7 +12,7 @@ from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealt
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info, Snapshot
 from bms_estimator.pack.pack import Pack, Step
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.service_status import Latency, ServiceStatus
+from bms_estimator.service.service_status import LatencyHistogram, ServiceStatus
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
@@ -88,7 +88,7 @@ class Publisher:
         self._totals = totals or LifetimeTotals(estimator, new_totals(clock.wall()))
         self._rest = RestDetector(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
-        self._latency = Latency()
+        self._latency = LatencyHistogram()
         self._forecast_sent_s = -math.inf  # time of the last payload of the curves
         self._no_forecast = no_forecast(cell.no_forecast_reason)
         self._device_soc: float | None = None  # SOC that the device reported last

@@ -18,7 +18,7 @@ BINS = 100
 """Number of bins; the last one begins at four minutes."""
 
 
-class Latency:
+class LatencyHistogram:
     """Histogram of latencies in logarithmic bins, so that adding a value is cheap."""
 
     def __init__(self) -> None:

@@ -92,7 +92,7 @@ MIN_SHORT_C = 1 / 30_000
 MIN_READING_ERROR_V = 0.01
 """Default limit of the error of a cell's reading [V]: ten steps of the usual converter."""
 BALANCING_BELOW_V = 0.25
-"""Voltage below the default limit of ``cell_over_voltage`` from which balancers are usually active [V]: 3.40 V for LFP,
+"""Distance below the default limit of ``cell_over_voltage`` from which balancers are usually active [V]: 3.40 V for LFP,
 4.00 V for cells that are charged to 4.2 V."""
 
 

@@ -14,7 +14,7 @@ UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": 
 """Units by the part of a key after its last underscore."""
 COMMENT_WIDTH = 110
 """Maximum line length of comments."""
-HEAD = """\
+HEADER_COMMENT = """\
 # Settings of one pack. A setting that begins with # has the default value shown; remove the # to change it.
 # A key such as poll_s ends in the unit of its value. Current is positive on discharge.
 """
@@ -32,7 +32,7 @@ def settings_file(model: type[BaseModel], given: GivenSettings = MappingProxyTyp
         model: Model of the whole file; each of its fields is a section.
         given: Settings that are written without ``#``. An optional section is written without ``#`` if it is given.
     """
-    lines = [HEAD]
+    lines = [HEADER_COMMENT]
     for name, field in model.model_fields.items():
         is_optional = field.default is None
         effect_of_omission = f" {_sentence(field.description)}" if is_optional and field.description else ""

@@ -12,7 +12,7 @@ from bms_estimator.setup.broker_login import BrokerLogin
 NAME_SEPARATOR = ":"
 """Separator between profile and address in ``FoundDevice.name``."""
 SAME_PACK_TOLERANCE = 0.02
-"""Maximum difference of the voltages of two devices of one pack, as a fraction."""
+"""Maximum relative difference between the voltages of two devices of one pack."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class FoundDevice:
 
 
 def with_pairs(devices: Sequence[FoundDevice]) -> list[FoundDevice]:
-    """Return the devices, and each pair of a battery monitor, such as a shunt, and a BMS that may be of one pack."""
+    """Return the devices, and each pair of a battery monitor, such as a shunt, and a BMS that may belong to one pack."""
     pairs = [
         _pair(a, b) for a in devices for b in devices if b.has_cells and not a.has_cells and _may_be_of_one_pack(a, b)
     ]

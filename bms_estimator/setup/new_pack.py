@@ -15,7 +15,7 @@ from bms_estimator.settings.settings_template import settings_file
 from bms_estimator.setup.answers import Answers
 
 CAPACITY_TOLERANCE = 0.2
-"""Relative difference of the capacity to that of the device without a warning. A worn pack may have a fifth less than rated."""
+"""Maximum relative deviation from the capacity that the device reports. A worn pack may have a fifth less than rated."""
 
 
 @dataclass(frozen=True)

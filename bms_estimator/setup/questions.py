@@ -212,7 +212,7 @@ def _parse_limit_v(key: str, text: str, answers: Answers, *, above_middle: bool)
 
 
 def _suggest_limit_v(answers: Answers, index: int) -> str:
-    """Return the usual voltage limit of the pack, empty before its cells are known; a shipped cell file has its own limits."""
+    """Return the usual voltage limit of the pack; empty before its cells are known. A shipped cell file has its own limits."""
     if answers.cell is None or answers.series is None:
         return ""
     if answers.cell not in USUAL_LIMITS_V:

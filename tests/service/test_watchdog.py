@@ -11,7 +11,7 @@ from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service import publisher
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.service.pack_service import recording_health
-from bms_estimator.service.service_status import Latency, ServiceStatus
+from bms_estimator.service.service_status import LatencyHistogram, ServiceStatus
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
@@ -144,7 +144,7 @@ async def test_health_contains_the_latency_of_samples_and_the_number_of_waiting_
 
 
 def test_latency_percentiles_are_at_most_a_fifth_too_high() -> None:
-    latency = Latency()
+    latency = LatencyHistogram()
     assert latency.pop_summary() is None
     for latency_s in [0.002] * 97 + [0.05, 0.05, 0.7]:
         latency.add(latency_s)

@@ -11,7 +11,7 @@ import structlog
 import typer
 
 from bms_estimator.cli.options.pack_options import with_sensor
-from bms_estimator.cli.options.port_options import OtherPort
+from bms_estimator.cli.options.port_options import PortOverride
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.instance_lock import instance_lock
@@ -108,7 +108,7 @@ def edge(
     pack: Annotated[Path, typer.Argument(help="settings file of the pack, with a section \\[edge]")] = Path(
         "pack.toml"
     ),
-    port: OtherPort = None,
+    port: PortOverride = None,
 ) -> None:
     """Send a pack's raw samples to a fleet server until SIGINT, SIGTERM or SIGHUP.
 

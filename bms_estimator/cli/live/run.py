@@ -14,7 +14,7 @@ import typer
 
 from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
-from bms_estimator.cli.options.port_options import OtherPort
+from bms_estimator.cli.options.port_options import PortOverride
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.log_setup import configure_logs, flush_logs
@@ -33,7 +33,7 @@ def run(
     packs: Annotated[
         list[Path] | None, typer.Argument(help="settings files, one for each pack", show_default="pack.toml")
     ] = None,
-    port: OtherPort = None,
+    port: PortOverride = None,
     mqtt: Annotated[
         str | None, typer.Option(help="MQTT broker that replaces mqtt.url of the settings, mqtt://host:port")
     ] = None,

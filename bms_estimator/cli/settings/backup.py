@@ -28,7 +28,7 @@ Archive = Annotated[Path, typer.Argument(metavar="FILE", help="archive, .tar.gz"
 
 
 def backup(pack: Pack, file: Archive) -> None:
-    """Write the settings of a pack, their passwords, and everything learned to one archive. Stop its service first.
+    """Write the settings of a pack, its passwords and its learned state to one archive. Stop its service first.
 
     `restore` reads the archive on another machine.
     """

@@ -201,7 +201,7 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
 
 
 def _log_in(prompts: Prompts, result: SearchResult) -> SearchResult:
-    """Ask for user name and password of each broker that requires them, and search it again until they are right or empty."""
+    """Ask for the login of each broker that requires one, and search the broker again, until the login is right or empty."""
     while result.login_required and prompts.is_interactive:
         login, *others = result.login_required
         username = str(
