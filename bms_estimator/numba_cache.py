@@ -34,7 +34,7 @@ from numba.core.serialize import dumps
 
 __all__ = [
     "CACHE_FOLDER",
-    "COMPILED_IN",
+    "COMPILED_SOURCES",
     "SHIPPED_FOLDER",
     "cache_folders",
     "njit",
@@ -54,7 +54,7 @@ _unliteral: Any = types.unliteral
 _rebuild: Any = CompileResultCacheImpl.rebuild
 _dumps: Any = dumps
 _PACKAGE = Path(__file__).parent
-COMPILED_IN = (
+COMPILED_SOURCES = (
     *sorted((_PACKAGE / "kernels").rglob("*.py")),
     *(
         _PACKAGE / file
@@ -73,8 +73,8 @@ COMPILED_IN = (
     ),
 )
 """Files whose content is compiled into kernels: kernels, frame decoding and their constants."""
-# Before numba chooses the target of the first kernel. It reads its settings again when such a variable has changed. Without
-# the empty list of features, it would add those of this machine's CPU.
+# Set before the first kernel is compiled, because numba then chooses the target. Without the empty list of features, numba
+# would add those of this machine's CPU.
 os.environ |= {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 numba.config.reload_config()  # type: ignore[no-untyped-call]
 
@@ -114,9 +114,9 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Function], Functio
 
 
 def source_digest() -> str:
-    """Return a hash of numba's version and all files in ``COMPILED_IN``, the name of a folder within a cache folder."""
+    """Return the name of this version's folder in a cache folder: a hash of numba's version and the files in ``COMPILED_SOURCES``."""
     digest = hashlib.sha256(numba.__version__.encode())
-    for source in COMPILED_IN:
+    for source in COMPILED_SOURCES:
         digest.update(source.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -169,7 +169,7 @@ class _KernelCache(NullCache):
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Return the compiled kernel; None if it must be compiled."""
-        context.refresh()  # numba's functions for the target
+        context.refresh()  # registers numba's built-in functions for the target
         for folder in (SHIPPED_FOLDER, CACHE_FOLDER):
             path = self._file(folder, signature, context.codegen())
             if path is not None:
@@ -180,7 +180,7 @@ class _KernelCache(NullCache):
     def save_overload(self, signature: Any, kernel: Any) -> None:
         """Write a compiled kernel. An interrupted process leaves no damaged file."""
         path = self._file(CACHE_FOLDER, signature, kernel.library.codegen)
-        if path is None or kernel.library.has_dynamic_globals:  # addresses of this process
+        if path is None or kernel.library.has_dynamic_globals:  # the code contains addresses of this process
             return
         content: bytes = _dumps(kernel._reduce())  # noqa: SLF001 - as in numba's own cache
         with _warn_on_error("compiled kernels are not stored"):
@@ -228,8 +228,8 @@ def _warn_on_error(text: str) -> Iterator[None]:
 def _import_without_blas() -> None:
     """Import numba's array functions without ``scipy.linalg``, whose import takes a fifth of the time to load the kernels.
 
-    numba imports it to find out whether a BLAS exists. No kernel uses one. Without it, ``numpy.correlate`` and
-    ``numpy.convolve`` in compiled code of other packages use a loop.
+    numba imports ``scipy.linalg`` to find out whether a BLAS exists. No kernel uses a BLAS. Without a BLAS, ``numpy.correlate``
+    and ``numpy.convolve`` in compiled code of other packages use a loop.
     """
     linalg: Any = importlib.import_module("numba.np.linalg")
     ensure_blas, linalg.ensure_blas = linalg.ensure_blas, _deny_blas
@@ -247,8 +247,9 @@ def _deny_blas() -> None:
 def _kernel_lock(name: str) -> Iterator[None]:
     """Exclude other processes from compiling the kernel ``name``. Without a cache folder, do nothing.
 
-    A kernel locks the kernels that it calls, never the other way round, so that no two processes wait for each other.
-    The lock ends with the process.
+    A process that compiles a kernel also locks the kernels that it calls, but never its callers. Therefore no two processes
+    wait for each other.
+    The system releases the lock when the process ends.
     """
     if _lock_file is None:
         yield

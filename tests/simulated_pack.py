@@ -40,7 +40,7 @@ class SimulatedPack:
     def __init__(self, cells: BankCells | None = None, chemistry: str = "nmc", seed: int = 1) -> None:
         self.rng = np.random.default_rng(seed)
         cell = load_cell(chemistry, CAPACITY_AH)
-        self.bank = SimulatedBank(cell, cells or BankCells.drawn(self.rng, CELLS, CAPACITY_AH, 0.9))
+        self.bank = SimulatedBank(cell, cells or BankCells.random(self.rng, CELLS, CAPACITY_AH, 0.9))
         self.model = cell.pack(self.bank.cells.soc.size, 1)
         self.estimator = Estimator(self.model, voltage_resolution_v=0.01, sampling=BOARD)
         self.cells = CellEstimator(self.estimator)

@@ -57,7 +57,7 @@ COMMANDS = {
     ),
     "calibrate": LazyCommand(
         "bms_estimator.cli.cell.calibrate:calibrate_command",
-        "Write a cell file for your own cell, from captures or beside a pack.",
+        "Write a cell file for your own cell, from captures or by a guided test of a pack.",
     ),
     "ocv": LazyCommand(
         "bms_estimator.cli.cell.ocv:ocv",
@@ -75,7 +75,7 @@ COMMANDS = {
     ),
     "accuracy": LazyCommand(
         "bms_estimator.cli.cell.accuracy:accuracy",
-        "Compute how well the SOC of a pack can be known, and which change helps most.",
+        "Compute how accurately the SOC of a pack can be estimated, and which change helps most.",
     ),
     "cell": LazyCommand(
         "bms_estimator.cli.cell.commands:app",

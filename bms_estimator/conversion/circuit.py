@@ -115,7 +115,7 @@ EXTREME_TEMPERATURE_DIFFERENCE_K = 40.0
 
 def c_header(cell: CellModel) -> str:
     """Return the text of a C99 header with tables of the OCV and of the RC ladder, and the equations as a comment."""
-    curve, ladder, ratings = _thinned(cell), ladder_table(cell), cell.cell
+    curve, ladder, ratings = _thinned_ocv(cell), ladder_table(cell), cell.cell
     ocv_shape, ohm_shape = "[CELL_OCV_NODES]", "[CELL_OHM_NODES]"
     tables = [
         _table("CELL_TAU_S[CELL_RC_PAIRS]", np.array(TAU_S)),
@@ -129,25 +129,25 @@ def c_header(cell: CellModel) -> str:
     ]
     return fill_template(
         "cell.h.txt",
-        name=_comment(ratings.name),
-        description=f": {_comment(ratings.description)}" if ratings.description else "",
+        name=_comment_text(ratings.name),
+        description=f": {_comment_text(ratings.description)}" if ratings.description else "",
         version=__version__,
         series_count=ratings.series_count,
         guard=re.sub(r"\W", "_", ratings.name, flags=re.ASCII).upper(),
-        capacity_as=_float(3600.0 * ratings.capacity_ah),
+        capacity_as=_c_float(3600.0 * ratings.capacity_ah),
         pairs=BRANCHES,
         ocv_nodes=curve.soc.size,
         ohm_nodes=ladder.soc.size,
         trend=TREND_PAIR,
-        weak_k=_float(LOW_ACTIVATION_ENERGY / GAS_CONSTANT),
-        strong_k=_float(HIGH_ACTIVATION_ENERGY / GAS_CONSTANT),
-        hysteresis_k=_float(HYSTERESIS_ACTIVATION_ENERGY / GAS_CONSTANT),
-        hysteresis_soc=_float(Noise().hysteresis_soc),
+        weak_k=_c_float(LOW_ACTIVATION_ENERGY / GAS_CONSTANT),
+        strong_k=_c_float(HIGH_ACTIVATION_ENERGY / GAS_CONSTANT),
+        hysteresis_k=_c_float(HYSTERESIS_ACTIVATION_ENERGY / GAS_CONSTANT),
+        hysteresis_soc=_c_float(Noise().hysteresis_soc),
         tables="\n".join(tables),
     )
 
 
-def _thinned(cell: CellModel) -> OcvTable:
+def _thinned_ocv(cell: CellModel) -> OcvTable:
     """Return the OCV at the fewest nodes between which linear interpolation is within ``INTERPOLATION_ERROR_V``.
 
     The table of the cell file is interpolated by a cubic curve, which firmware need not evaluate.
@@ -189,24 +189,24 @@ def _linear_error(x: Floats, rows: Floats, first: int, end: int) -> float:
 
 
 def _table(declaration: str, values: Floats) -> str:
-    return f"static const CELL_MEMORY float {declaration} = {{\n{value_lines(_floats(values), 4)}\n}};\n"
+    return f"static const CELL_MEMORY float {declaration} = {{\n{value_lines(_c_floats(values), 4)}\n}};\n"
 
 
 def _matrix(declaration: str, rows: Floats) -> str:
-    text = ",\n".join(f"    {{\n{value_lines(_floats(row), 8)}\n    }}" for row in rows)
+    text = ",\n".join(f"    {{\n{value_lines(_c_floats(row), 8)}\n    }}" for row in rows)
     return f"static const CELL_MEMORY float {declaration} = {{\n{text}\n}};\n"
 
 
-def _floats(values: Floats) -> list[str]:
-    return [_float(x) for x in values.tolist()]
+def _c_floats(values: Floats) -> list[str]:
+    return [_c_float(x) for x in values.tolist()]
 
 
-def _float(value: float) -> str:
+def _c_float(value: float) -> str:
     """Return a float constant of C with the nine digits that restore each single-precision number."""
     text = f"{value:.9g}"
     return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
 
 
-def _comment(text: str) -> str:
+def _comment_text(text: str) -> str:
     """Return a text without line breaks and ``*/``, because the text of a foreign cell file must not end the C comment."""
     return " ".join(text.replace("*/", "* /").split())

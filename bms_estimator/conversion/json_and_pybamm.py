@@ -30,11 +30,11 @@ from bms_estimator.model.config_file import Strict
 from bms_estimator.model.pack_model import DIGITS
 from bms_estimator.version import __version__
 
-PAIR = """\
+PAIR_LINES = """\
         "R{k} [Ohm]": lambda temperature_c, current_a, soc: pair_ohm({k}, temperature_c, current_a, soc),
         "C{k} [F]": lambda temperature_c, current_a, soc: pair_farad({k}, temperature_c, current_a, soc),
         "Element-{k} initial overpotential [V]": 0,"""
-"""Values of RC pair k."""
+"""Lines of RC pair k in the module's parameters."""
 
 
 def pybamm_module(cell: CellModel) -> str:
@@ -54,7 +54,7 @@ def pybamm_module(cell: CellModel) -> str:
         elements=_two_pairs(cell) if cell.ladder is None else _ladder(cell),
         voltage_min_v=ratings.voltage_min_v,
         voltage_max_v=ratings.voltage_max_v,
-        pair_values="\n".join(PAIR.format(k=k) for k in range(1, pair_count + 1)),
+        pair_values="\n".join(PAIR_LINES.format(k=k) for k in range(1, pair_count + 1)),
     )
 
 

@@ -23,7 +23,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.page_sink import Pages
-from bms_estimator.process.child_process import ends_with_us, find_server
+from bms_estimator.process.child_process import find_server, terminate_with_parent
 from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.mqtt import MqttSettings
@@ -93,23 +93,23 @@ class DemoBroker:
 
     async def _start(self, folder: Path, stack: contextlib.AsyncExitStack) -> None:
         config, log = folder / "nats.conf", folder / "log"
-        config.write_text(_configuration(folder / "streams", self.port))
+        config.write_text(_server_config(folder / "streams", self.port))
         process = await asyncio.create_subprocess_exec(
             *(self._server, "-c", config, "-l", log, "--ports_file_dir", folder),
-            preexec_fn=ends_with_us(),
+            preexec_fn=terminate_with_parent(),
             start_new_session=True,  # Ctrl-C in the terminal must end the service before its broker
         )
         stack.push_async_callback(_terminate, process)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(START_TIMEOUT_S):
-                while not _listens(folder) and process.returncode is None:  # noqa: ASYNC110 - the server reports its start only by a file
+                while not _is_listening(folder) and process.returncode is None:  # noqa: ASYNC110 - the server reports its start only by a file
                     await asyncio.sleep(POLL_S)
-        if not _listens(folder):
+        if not _is_listening(folder):
             reason = log.read_text(errors="replace").strip() if log.exists() else ""
             raise UserError(f"the demo's broker {self._server} does not start: {reason or 'it wrote no log'}")
 
 
-def _listens(folder: Path) -> bool:
+def _is_listening(folder: Path) -> bool:
     """Return True once the server has written its ports file, which it does when it listens on all ports."""
     return any(folder.glob("*.ports"))
 
@@ -120,7 +120,7 @@ async def _terminate(process: asyncio.subprocess.Process) -> None:
     await process.wait()
 
 
-def _configuration(folder: Path, mqtt_port: int) -> str:
+def _server_config(folder: Path, mqtt_port: int) -> str:
     """Return the server's settings. Its port for NATS clients is unused. The port number -1 selects any free port."""
     return f"""
 server_name: demo
@@ -149,7 +149,6 @@ def choose_port(port: int | None, default_port: int, option: str) -> int:
 
 
 def _is_free(port: int) -> bool:
-    """Return True if the port is free."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port with old connections in TIME_WAIT is free
         try:
@@ -179,11 +178,11 @@ SLOWDOWN = 500.0
 """Divisor of the weights in the adaptive law (3.18) of the thesis. With the printed weights, the law moves a1..a12 to their limits
 within half a second, too fast to be watched. A common divisor slows it down and leaves the limits unchanged."""
 REST_S = 60.0
-"""Rest of the cell while a1..a12 move [s]. R_s by (4.2) can be computed only after they have reached their limits, and only from a
-rest on, at which the RC voltages are known."""
+"""Rest of the cell at the start, in which a1..a12 reach their limits [s]. R_s by (4.2) is computed only after that. It requires
+the RC voltages, which are known after a rest."""
 RESOLUTION_V = 5e-3
-"""Resolution of the board's voltage [V]. The board averages noisy conversions, so that it is a fifth of the converter's
-step."""
+"""Resolution of the board's voltage [V]. It is a fifth of the converter's step, because the board averages noisy
+conversions."""
 PUBLISH_RATE_HZ = 4.0
 """Publish rate [Hz]."""
 LAMBDA = 1e4

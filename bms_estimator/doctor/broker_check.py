@@ -1,4 +1,4 @@
-"""Check of the MQTT brokers: whether they can be reached, and whether the pack's topics may be published and read.
+"""Check of the MQTT brokers: connection, and permission to publish and read the pack's topics.
 
 The only message that is published is ``offline``, not retained, on the pack's availability topic, and only while no service
 of the pack is online. A test of other topics would send false values to their subscribers. A running service reports denied
@@ -12,27 +12,27 @@ from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 
 from bms_estimator.doctor import device_check
-from bms_estimator.doctor.finding import Finding, Level, Subject, fault, ok, warning
+from bms_estimator.doctor.finding import ExaminedPack, Finding, Level, fault, ok, warning
 from bms_estimator.mqtt.broker_config import Broker, brokers
 from bms_estimator.mqtt.client import Timeouts
 from bms_estimator.mqtt.connection import BrokerConnectionError, Connection, ConnectOptions, LoginError, Message
 from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
-from bms_estimator.process.systemd import is_for_the_service
+from bms_estimator.process.systemd import is_unreadable_credential
 from bms_estimator.settings.broker import BrokerSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY
 
 NAME = "broker"
-RETAINED_S = 0.5
+RETAINED_TIMEOUT_S = 0.5
 """Time within which a broker sends retained messages after a subscription [s]."""
-ECHO_S = 2.0
+ECHO_TIMEOUT_S = 2.0
 """Time within which a broker returns a message [s]."""
 TIMEOUTS = Timeouts(connect_s=4.0, acknowledge_s=3.0)
 ACCESS_LIST_REMEDY = "correct the broker's access list, for Mosquitto: deploy/mosquitto/pack.acl"
 """Remedy for a denied topic."""
 
 
-def check_broker(subject: Subject) -> Iterator[Finding]:
-    """Yield whether brokers and fleet server can be reached, which topics a broker denies, and the health of a running service.
+def check_broker(subject: ExaminedPack) -> Iterator[Finding]:
+    """Yield findings on the connection to brokers and fleet server, on denied topics, and on the health of a running service.
 
     Raises:
         UserError: A setting of ``[mqtt]`` or ``[edge]`` cannot be used.
@@ -47,7 +47,7 @@ def check_broker(subject: Subject) -> Iterator[Finding]:
         yield from _check_section(subject, edge, None)
 
 
-def _check_section(subject: Subject, settings: BrokerSettings, pack_topic: str | None) -> Iterator[Finding]:
+def _check_section(subject: ExaminedPack, settings: BrokerSettings, pack_topic: str | None) -> Iterator[Finding]:
     """Yield the findings on the brokers of a section.
 
     Args:
@@ -55,7 +55,7 @@ def _check_section(subject: Subject, settings: BrokerSettings, pack_topic: str |
         settings: The section.
         pack_topic: Topic of the pack, below which rights are checked; None: rights are not checked.
     """
-    if settings.password_file and is_for_the_service(settings.password_file):
+    if settings.password_file and is_unreadable_credential(settings.password_file):
         text = f"{', '.join(settings.urls)}: not checked, because only the running service can read its password"
         unit = subject.unit.name if subject.unit else "bms-estimator"
         yield warning(NAME, text, f"read the log of the service: journalctl -u {unit}")
@@ -99,7 +99,7 @@ async def _examine(
 
 
 async def _examine_rights(connection: Connection, pack_topic: str, silence_remedy: str) -> AsyncIterator[Finding]:
-    """Yield whether the pack's topics may be read and written, or the health of a running service."""
+    """Yield findings on the rights to the pack's topics, or on the health of a running service."""
     topic = f"{pack_topic}/{AVAILABILITY}"
     denied = await connection.subscribe(f"{pack_topic}/request/+", [topic, f"{pack_topic}/health"])
     denied.pop(f"{pack_topic}/health", None)  # the service itself need not read it
@@ -123,7 +123,7 @@ async def _retained_messages(connection: Connection) -> dict[str, bytes]:
     """Return the payloads of retained messages by topic."""
     retained = dict[str, bytes]()
     try:
-        async with asyncio.timeout(RETAINED_S):
+        async with asyncio.timeout(RETAINED_TIMEOUT_S):
             while True:
                 message = await connection.receive()
                 retained[message.topic] = message.payload
@@ -134,7 +134,7 @@ async def _retained_messages(connection: Connection) -> dict[str, bytes]:
 async def _is_echoed(connection: Connection, topic: str) -> bool:
     """Return True if a message on ``topic`` arrives."""
     try:
-        async with asyncio.timeout(ECHO_S):
+        async with asyncio.timeout(ECHO_TIMEOUT_S):
             while (await connection.receive()).topic != topic:
                 pass
     except TimeoutError:
@@ -143,7 +143,7 @@ async def _is_echoed(connection: Connection, topic: str) -> bool:
 
 
 def _health_of_service(payload: bytes, silence_remedy: str) -> Iterator[Finding]:
-    """Yield the topics that the broker denies to the running service, and whether samples arrive, by its health message."""
+    """Yield findings from the health message of the running service, on denied topics and on samples."""
     try:
         health = json.loads(payload)
         topics, is_silent = health["refused_topics"], not health["sensor_online"]

@@ -11,7 +11,7 @@ import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from bms_estimator.doctor.finding import Finding, Subject, fault, ok, warning
+from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.protocols.registry import make_protocol
@@ -20,12 +20,12 @@ from bms_estimator.sources.serial.known_board_file import STORED_FIELDS, KnownBo
 from bms_estimator.sources.serial.port_list import NoPortError, holder, resolve_port
 
 NAME = "device"
-FIRST_SAMPLE_S = 8.0
+FIRST_SAMPLE_TIMEOUT_S = 8.0
 """Time within which a device must send a sample [s]. Opening the port may reset a board, whose boot loader takes 2 s."""
-CELLS_S = 2.0
+CELLS_TIMEOUT_S = 2.0
 """Time after the first sample within which a device sends all cell voltages [s]. Some report them in several responses."""
 PSEUDO_TERMINALS = "/dev/pts/"
-"""Folder of pseudo-terminals, on which simulated devices are."""
+"""Folder of pseudo-terminals, which simulated devices use."""
 UNCALIBRATED_BANDGAP_V = "1.1"
 """Bandgap voltage that a board reports before it is calibrated."""
 SERIAL_REMEDY = "check cable, sensor.protocol and sensor.baud; see which device answers: bms-estimator ports --probe"
@@ -39,7 +39,7 @@ NOT_EXAMINED = warning(
 )
 """Finding on the device of a running service whose health cannot be read."""
 CALIBRATION_FIELDS = STORED_FIELDS[1:]
-"""Fields of a board's hello that its calibration changes."""
+"""Fields of a board's hello that its calibration changes: all stored fields but the serial number."""
 
 
 class NoSampleError(Exception):
@@ -48,7 +48,7 @@ class NoSampleError(Exception):
 
 @dataclass(frozen=True)
 class FirstSample:
-    """First sample of a device, with the cells of the next samples."""
+    """First sample of a device, and the number of cells in the samples that follow."""
 
     voltage_v: float
     current_a: float
@@ -64,14 +64,14 @@ class FirstSample:
         return f"{self.voltage_v:.3f} V, {current}{f'; {names}' if names else ''}"
 
 
-def load_decoder(subject: Subject) -> None:
+def load_decoder(subject: ExaminedPack) -> None:
     """Load the kernel that decodes a board's frames. Without a cache it is compiled, which takes longer than a check's timeout."""
     if subject.settings.source is None and not subject.is_running:
         make_protocol(subject.settings.sensor).feed(0.0, b"\0\n")  # ends a frame, or a line of text
 
 
-def check_device(subject: Subject) -> Iterator[Finding]:
-    """Yield whether the device sends samples, and whether its board is calibrated and known."""
+def check_device(subject: ExaminedPack) -> Iterator[Finding]:
+    """Yield findings on the samples of the device, and on the calibration and identity of a board."""
     source = subject.settings.source
     name = source.short_description if source else subject.settings.sensor.port
     if subject.is_running:
@@ -101,7 +101,7 @@ def check_device(subject: Subject) -> Iterator[Finding]:
         yield from check_board(subject, sample.board)
 
 
-def silence_remedy(subject: Subject) -> str:
+def silence_remedy(subject: ExaminedPack) -> str:
     """Return the remedy for a silent device."""
     return SERIAL_REMEDY if subject.settings.source is None else SOURCE_REMEDY
 
@@ -118,7 +118,7 @@ def _port_holder(port: str) -> str | None:
     return None if os.path.realpath(path).startswith(PSEUDO_TERMINALS) else holder(path)
 
 
-async def _first_sample(subject: Subject) -> FirstSample:
+async def _first_sample(subject: ExaminedPack) -> FirstSample:
     """Return the first sample of the pack's source.
 
     Raises:
@@ -128,23 +128,23 @@ async def _first_sample(subject: Subject) -> FirstSample:
     series, sample = subject.model.cell.series_count, None
     async with source:
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(FIRST_SAMPLE_S) as limit:
+            async with asyncio.timeout(FIRST_SAMPLE_TIMEOUT_S) as limit:
                 async for received in source:
                     last = received.samples[-1]
                     cells = max(is_live(received.cells_v).sum(axis=1), default=0)
                     if sample is None:
                         sample = FirstSample(float(last["voltage_v"]), float(last["current_a"]), dict(source.board), 0)
-                        limit.reschedule(asyncio.get_running_loop().time() + CELLS_S)
+                        limit.reschedule(asyncio.get_running_loop().time() + CELLS_TIMEOUT_S)
                     sample = replace(sample, cells=max(sample.cells, int(cells)))
                     if sample.cells == series or sample.board.get("bandgap_v"):
                         break
         if sample is None:
-            raise NoSampleError(source.silence_reason or f"no sample within {FIRST_SAMPLE_S:g} s")
+            raise NoSampleError(source.silence_reason or f"no sample within {FIRST_SAMPLE_TIMEOUT_S:g} s")
         return sample
 
 
-def check_board(subject: Subject, board: Mapping[str, str]) -> Iterator[Finding]:
-    """Yield whether a board is calibrated, and whether it is the board of the pack.
+def check_board(subject: ExaminedPack, board: Mapping[str, str]) -> Iterator[Finding]:
+    """Yield findings on the calibration of a board, and on its identity.
 
     Args:
         subject: The pack.

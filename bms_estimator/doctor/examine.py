@@ -13,15 +13,15 @@ from importlib.metadata import version
 from pathlib import Path
 
 from bms_estimator.doctor.broker_check import check_broker
-from bms_estimator.doctor.device_check import CELLS_S, FIRST_SAMPLE_S, check_device
-from bms_estimator.doctor.finding import Finding, Subject, fault, ok, warning
+from bms_estimator.doctor.device_check import CELLS_TIMEOUT_S, FIRST_SAMPLE_TIMEOUT_S, check_device
+from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
 from bms_estimator.doctor.kernel_check import check_kernels
 from bms_estimator.doctor.port_check import check_port
 from bms_estimator.doctor.service_check import check_service
-from bms_estimator.installation import places
+from bms_estimator.installation import paths
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.boot_clock import TIMESYNCD, synchronised
+from bms_estimator.process.boot_clock import TIMESYNCD, is_clock_synchronized
 from bms_estimator.service import pack_check
 from bms_estimator.version import __version__
 
@@ -74,7 +74,7 @@ def _run(check: Check) -> None:
 SETTINGS = "settings"
 
 
-def check_settings(subject: Subject) -> Iterator[Finding]:
+def check_settings(subject: ExaminedPack) -> Iterator[Finding]:
     """Yield a summary of the settings, and each likely mistake.
 
     Raises:
@@ -93,8 +93,8 @@ CHECKPOINTS_MB = 10.0
 """Size of checkpoints, temporary files and the queue of a short outage [MB]."""
 
 
-def check_disk(subject: Subject) -> Iterator[Finding]:
-    """Yield whether the state folder can be written, and whether the disk has room for the history."""
+def check_disk(subject: ExaminedPack) -> Iterator[Finding]:
+    """Yield findings on the permissions of the state folder, and on the disk space for the history."""
     folder = subject.state_folder
     existing = _nearest_existing(folder)
     if not os.access(existing, os.R_OK | os.W_OK | os.X_OK):
@@ -143,28 +143,28 @@ REAL_TIME_CLOCK = Path("/dev/rtc0")
 """Clock with a battery."""
 
 
-def check_clock(subject: Subject | None) -> Iterator[Finding]:
-    """Yield whether the clock is synchronized, and whether the service can detect that."""
+def check_clock(subject: ExaminedPack | None) -> Iterator[Finding]:
+    """Yield findings on the synchronization of the clock, and on the service's access to its state."""
     hardware = "a clock with a battery" if REAL_TIME_CLOCK.exists() else "no clock with a battery"
-    if synchronised():
+    if is_clock_synchronized():
         yield ok(CLOCK, f"synchronized; {hardware}")
     else:
         text = f"not synchronized; {hardware}: the length of a power-off counts as unknown"
         yield warning(CLOCK, text, "sudo timedatectl set-ntp true; in a container: synchronize the host")
-    if subject and subject.unit and synchronised() and not TIMESYNCD.exists():
-        drop_in = places.clock_drop_in(places.TEMPLATE if "@" in subject.unit.name else places.UNIT)
+    if subject and subject.unit and is_clock_synchronized() and not TIMESYNCD.exists():
+        drop_in = paths.clock_drop_in(paths.TEMPLATE if "@" in subject.unit.name else paths.UNIT)
         if not drop_in.exists():
             text = "the service cannot see that the clock is synchronized, because systemd-timesyncd does not run"
             yield warning(CLOCK, text, f"{shlex.join(root_command('install'))}, which adds {drop_in.name} to the unit")
 
 
 CLOSING_S = 4.0
-"""Time to close a device [s]."""
-BROKER_S = 12.0
-"""Time within which a broker is examined: connection, subscription, retained messages and echo [s]."""
+"""Time that is allowed for closing a device [s]."""
+BROKER_TIMEOUT_S = 12.0
+"""Timeout of the check of a broker: connection, subscription, retained messages and echo [s]."""
 
 
-def examine(subject: Subject | None) -> Iterator[Finding]:
+def examine(subject: ExaminedPack | None) -> Iterator[Finding]:
     """Run all checks at the same time, and yield their findings.
 
     Args:
@@ -175,8 +175,8 @@ def examine(subject: Subject | None) -> Iterator[Finding]:
         pack_checks = [
             Check("settings", partial(check_settings, subject)),
             Check("port", partial(check_port, subject)),
-            Check("device", partial(check_device, subject), FIRST_SAMPLE_S + CELLS_S + CLOSING_S),
-            Check("broker", partial(check_broker, subject), BROKER_S),
+            Check("device", partial(check_device, subject), FIRST_SAMPLE_TIMEOUT_S + CELLS_TIMEOUT_S + CLOSING_S),
+            Check("broker", partial(check_broker, subject), BROKER_TIMEOUT_S),
             Check("service", partial(check_service, subject)),
             Check("state folder", partial(check_disk, subject)),
         ]

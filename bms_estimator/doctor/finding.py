@@ -22,7 +22,7 @@ ROOT_USER = 0
 
 
 @dataclass(frozen=True)
-class Subject:
+class ExaminedPack:
     """Pack that is examined, and its service."""
 
     path: Path
@@ -54,7 +54,7 @@ class Subject:
         """True if a process on this machine serves the pack."""
         try:
             return is_locked(self.state_folder, self.settings.pack.name)
-        except RuntimeError:  # without a home folder no process of this user has a state folder in it
+        except RuntimeError:  # this user has no home folder, so that none of its processes has a state folder
             return False
 
     @property

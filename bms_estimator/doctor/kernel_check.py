@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from bms_estimator.doctor.finding import Finding, Subject, ok, warning
+from bms_estimator.doctor.finding import ExaminedPack, Finding, ok, warning
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.numba_cache import SHIPPED_FOLDER, cache_folders, source_digest
 from bms_estimator.process.memory import available_bytes
@@ -16,8 +16,8 @@ MAX_OTHER_VERSIONS = 3
 """Maximum number of folders with kernels of other versions without a warning. Each may take more than 100 MB."""
 
 
-def check_kernels(subject: Subject | None) -> Iterator[Finding]:
-    """Yield whether kernels are compiled, and whether they can be stored."""
+def check_kernels(subject: ExaminedPack | None) -> Iterator[Finding]:
+    """Yield findings on the compiled kernels, and on the folder in which they are stored."""
     if (SHIPPED_FOLDER / COMPLETE_FILE).exists():
         yield ok(NAME, f"{SHIPPED_FOLDER}: compiled kernels of the package")
         return
@@ -58,5 +58,5 @@ def _own_cache_folder() -> Path | None:
     return next((folder for folder in cache_folders() if os.access(folder, os.W_OK | os.X_OK)), None)
 
 
-def _command_as_root(subject: Subject | None) -> str:
+def _command_as_root(subject: ExaminedPack | None) -> str:
     return subject.command_as_root if subject else shlex.join(root_command("doctor"))

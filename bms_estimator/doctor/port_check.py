@@ -7,8 +7,8 @@ import stat
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from bms_estimator.doctor.finding import ROOT_USER, Finding, Subject, fault, is_root, ok, warning
-from bms_estimator.installation import places
+from bms_estimator.doctor.finding import ROOT_USER, ExaminedPack, Finding, fault, is_root, ok, warning
+from bms_estimator.installation import paths
 from bms_estimator.sources.serial.port_list import NoPortError, named_ports, resolve_port
 
 NAME = "port"
@@ -17,11 +17,11 @@ SERIAL_GROUP = "dialout"
 RULE_FOLDERS = (Path("/etc/udev/rules.d"), Path("/run/udev/rules.d"), Path("/usr/lib/udev/rules.d"))
 """Folders in which udev reads rules."""
 NOBODY = 65534
-"""User id without permissions. It stands for the service's user, whose only permission is the group ``SERIAL_GROUP``."""
+"""User id without permissions. It represents the service's user, whose only permission is the group ``SERIAL_GROUP``."""
 
 
-def check_port(subject: Subject) -> Iterator[Finding]:
-    """Yield whether the serial port exists, whether it may be opened, and whether the udev rule is installed."""
+def check_port(subject: ExaminedPack) -> Iterator[Finding]:
+    """Yield findings on the existence and permissions of the serial port, and on the udev rule."""
     if subject.settings.source is not None:
         return
     try:
@@ -29,10 +29,10 @@ def check_port(subject: Subject) -> Iterator[Finding]:
     except NoPortError as error:
         yield fault(NAME, str(error), "connect the device, or set sensor.port to one of: bms-estimator ports")
         return
-    yield _permission(subject, port)
+    yield _permission_finding(subject, port)
     usb_ports = {os.path.realpath(each.device) for each in named_ports().values() if each.vid is not None}
     if os.path.realpath(port) in usb_ports:
-        yield _udev_rule(subject)
+        yield _udev_rule_finding(subject)
 
 
 def may_open(status: os.stat_result, user: int, groups: Collection[int]) -> bool:
@@ -54,8 +54,8 @@ def may_open(status: os.stat_result, user: int, groups: Collection[int]) -> bool
     return status.st_mode & needed == needed
 
 
-def _permission(subject: Subject, port: str) -> Finding:
-    """Return whether this user, or as root the user of the systemd unit, may open the port."""
+def _permission_finding(subject: ExaminedPack, port: str) -> Finding:
+    """Return the finding on the permission of this user to open the port; as root, of the systemd unit's user."""
     status = Path(port).stat()
     owner = f"{_user_name(status.st_uid)}:{_group_name(status.st_gid)} {stat.filemode(status.st_mode)}"
     if is_root() and subject.unit:
@@ -81,11 +81,11 @@ def _groups_of_service() -> set[int]:
         return set()
 
 
-def _udev_rule(subject: Subject) -> Finding:
-    """Return whether the udev rule is installed. The rule names boards by their USB port, and excludes them from ModemManager."""
+def _udev_rule_finding(subject: ExaminedPack) -> Finding:
+    """Return the finding on the udev rule. The rule names boards by their USB port, and excludes them from ModemManager."""
     for folder in RULE_FOLDERS:
-        if (folder / places.UDEV_RULE.name).exists():
-            return ok("udev rule", f"{folder / places.UDEV_RULE.name}")
+        if (folder / paths.UDEV_RULE.name).exists():
+            return ok("udev rule", f"{folder / paths.UDEV_RULE.name}")
     text = "not installed: a board may get another name after a reboot, and ModemManager may write to it"
     return warning("udev rule", text, subject.install_command)
 

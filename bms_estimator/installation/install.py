@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from bms_estimator.installation import places
+from bms_estimator.installation import paths
 from bms_estimator.installation.machine import Machine, read_file, run, tree
 from bms_estimator.installation.program_copy import is_program_copy
 from bms_estimator.model.errors import UserError
 
 FILES = Path(__file__).parent / "files"
 """Folder with the original files."""
-SYSUSERS_LINES = (f'u {places.NAME} - "Battery estimator" {places.STATE}', f"m {places.NAME} dialout")
+SYSUSERS_LINES = (f'u {paths.NAME} - "Battery estimator" {paths.STATE}', f"m {paths.NAME} dialout")
 """Lines for systemd-sysusers that create the user of the service. Members of the group dialout may open serial ports."""
 UNIT_PROGRAM = "/opt/bms-estimator/bin/bms-estimator"
 """Program in the original unit, which is replaced by the installed program."""
@@ -44,23 +44,23 @@ def system_files(machine: Machine, program: Path) -> list[SystemFile]:
         program: Absolute path of the program on the machine.
     """
     unit = (FILES / "bms-estimator.service").read_text(encoding="utf-8").replace(UNIT_PROGRAM, str(program))
-    template = unit.replace(str(places.PACK_FILE), f"{places.SETTINGS}/%i.toml")
+    template = unit.replace(str(paths.PACK_FILE), f"{paths.SETTINGS}/%i.toml")
     rule = (FILES / "99-bms-estimator.rules").read_text(encoding="utf-8")
     files = [
-        SystemFile("unit", places.UNIT, unit),
-        SystemFile("unit", places.TEMPLATE, template),
-        SystemFile("udev rule", places.UDEV_RULE, rule),
+        SystemFile("unit", paths.UNIT, unit),
+        SystemFile("unit", paths.TEMPLATE, template),
+        SystemFile("udev rule", paths.UDEV_RULE, rule),
     ]
     # where these daemons set the clock, the drop-in allows the service to ask the kernel whether it is synchronized
-    if any(machine.path(daemon).exists() for daemon in places.CLOCK_DAEMONS):
+    if any(machine.path(daemon).exists() for daemon in paths.CLOCK_DAEMONS):
         drop_in = (FILES / "clock.conf").read_text(encoding="utf-8")
-        files += [SystemFile("unit", places.clock_drop_in(unit), drop_in) for unit in (places.UNIT, places.TEMPLATE)]
+        files += [SystemFile("unit", paths.clock_drop_in(unit), drop_in) for unit in (paths.UNIT, paths.TEMPLATE)]
     return files
 
 
 UDEV_CONTROL = Path("/run/udev/control")
 """Socket of udev, which does not run in containers."""
-OTHER_PACKS = f"{places.NAME}@*.service"
+OTHER_UNITS = f"{paths.NAME}@*.service"
 """Pattern of the units of other packs."""
 Report = Callable[[str, str], None]
 """Function that shows a finished step: its subject, and what was done."""
@@ -94,13 +94,13 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
     Raises:
         UserError: A file cannot be written, or a program of the system is missing or fails.
     """
-    is_upgrade = machine.path(places.UNIT).exists()
+    is_upgrade = machine.path(paths.UNIT).exists()
     _link_program(machine, program, report)
     machine.run("systemd-sysusers", "--inline", *SYSUSERS_LINES)
-    group = machine.group_id(places.NAME)
+    group = machine.group_id(paths.NAME)
     if group is None:
-        raise UserError(f"systemd-sysusers did not create the group {places.NAME}")
-    report("user", f"{places.NAME}, in group dialout")
+        raise UserError(f"systemd-sysusers did not create the group {paths.NAME}")
+    report("user", f"{paths.NAME}, in group dialout")
     if pack is not None:
         _require_same_pack(machine, pack)
         _write_settings(machine, pack, group, report)
@@ -110,49 +110,49 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
         report(file.kind, str(file.path))
     if machine.has_running_systemd:
         reload_system()
-    if not machine.path(places.PACK_FILE).exists() or (is_upgrade and pack is None and not _is_enabled(machine)):
+    if not machine.path(paths.PACK_FILE).exists() or (is_upgrade and pack is None and not _is_enabled(machine)):
         return False
-    machine.run("systemctl", "enable", "--quiet", places.UNIT.name)
+    machine.run("systemctl", "enable", "--quiet", paths.UNIT.name)
     report("service", "enabled: it starts with the machine")
     return True
 
 
 def compile_ahead(program: Path) -> None:
-    """Run the command ``compile`` as the user of the service, which shows a bar and fills the service's cache with missing kernels.
+    """Run the command ``compile`` as the user of the service. It shows a bar, and adds missing kernels to the service's cache.
 
     Otherwise the start of the service would take minutes without an explanation. If the compilation fails, the service repeats it.
     """
-    places.CACHE.mkdir(mode=0o755, exist_ok=True)
-    shutil.chown(places.CACHE, places.NAME, places.NAME)
+    paths.CACHE.mkdir(mode=0o755, exist_ok=True)
+    shutil.chown(paths.CACHE, paths.NAME, paths.NAME)
     variables = {
-        "NUMBA_CACHE_DIR": str(places.CACHE),
-        "PATH": places.SEARCH_PATH,
+        "NUMBA_CACHE_DIR": str(paths.CACHE),
+        "PATH": paths.SEARCH_PATH,
         "TERM": os.environ.get("TERM", "dumb"),
     }
     subprocess.run(  # noqa: S603 - this program
-        [program, "compile"], env=variables, cwd="/", user=places.NAME, group=places.NAME, extra_groups=(), check=False
+        [program, "compile"], env=variables, cwd="/", user=paths.NAME, group=paths.NAME, extra_groups=(), check=False
     )
 
 
-def start() -> None:
+def start_service() -> None:
     """Start or restart the service of this machine, and restart the running units of other packs.
 
     Raises:
         UserError: The service does not start.
     """
-    run(["systemctl", "try-restart", OTHER_PACKS])
+    run(["systemctl", "try-restart", OTHER_UNITS])
     try:
-        run(["systemctl", "restart", places.UNIT.name])
+        run(["systemctl", "restart", paths.UNIT.name])
     except UserError:
         raise UserError(
-            f"the service does not start; its log says why: journalctl -u {places.NAME} -n 20\n"
-            f"after a change of {places.PACK_FILE}: systemctl restart {places.NAME}"
+            f"the service does not start; its log says why: journalctl -u {paths.NAME} -n 20\n"
+            f"after a change of {paths.PACK_FILE}: systemctl restart {paths.NAME}"
         ) from None
 
 
-def restart_running() -> None:
+def restart_running_units() -> None:
     """Restart the running units, so that they run the upgraded program. Units that do not run are not started."""
-    run(["systemctl", "try-restart", places.UNIT.name, OTHER_PACKS])
+    run(["systemctl", "try-restart", paths.UNIT.name, OTHER_UNITS])
 
 
 def reload_system() -> None:
@@ -165,34 +165,34 @@ def reload_system() -> None:
 
 def _link_program(machine: Machine, program: Path, report: Report) -> None:
     """Link the program from the search path of root, unless a program of this name is there."""
-    folders = [machine.path(folder) for folder in places.SEARCH_PATH.split(":")]
-    if any((folder / places.NAME).exists() for folder in folders):
+    folders = [machine.path(folder) for folder in paths.SEARCH_PATH.split(":")]
+    if any((folder / paths.NAME).exists() for folder in folders):
         return
-    link = machine.path(places.PROGRAM_LINK)
+    link = machine.path(paths.PROGRAM_LINK)
     link.parent.mkdir(parents=True, exist_ok=True)
     link.unlink(missing_ok=True)
     link.symlink_to(program)
-    report("program", f"{places.PROGRAM_LINK}, a link to {program}")
+    report("program", f"{paths.PROGRAM_LINK}, a link to {program}")
 
 
 def _require_same_pack(machine: Machine, pack: PackFiles) -> None:
     """Refuse to replace the settings of another pack.
 
     Raises:
-        UserError: The installed settings are of another pack. The message has the commands that install this one beside it.
+        UserError: The installed settings belong to another pack. The message contains the commands that install both.
     """
-    installed = machine.read(places.PACK_FILE)
-    before = installed and _pack_name(installed)
+    installed = machine.read(paths.PACK_FILE)
+    installed_name = installed and _pack_name(installed)
     name = _pack_name(pack.settings.read_bytes())
-    if before and before != name:
-        target = places.SETTINGS / f"{name}.toml"
+    if installed_name and installed_name != name:
+        target = paths.SETTINGS / f"{name}.toml"
         files = " ".join(map(str, pack.named))
-        copy = f"\n  sudo install -m 640 -g {places.NAME} {files} {places.SETTINGS}" if files else ""
+        copy = f"\n  sudo install -m 640 -g {paths.NAME} {files} {paths.SETTINGS}" if files else ""
         raise UserError(
-            f"{places.PACK_FILE}: has the settings of the pack {before}, but {pack.settings} those of {name}; to run both:{copy}\n"
-            f"  sudo install -m 640 -g {places.NAME} {pack.settings} {target}\n"
-            f"  sudo systemctl enable --now {places.NAME}@{name}\n"
-            f"to replace {before}, remove {places.PACK_FILE} first"
+            f"{paths.PACK_FILE}: has the settings of the pack {installed_name}, but {pack.settings} those of {name}; to run both:{copy}\n"
+            f"  sudo install -m 640 -g {paths.NAME} {pack.settings} {target}\n"
+            f"  sudo systemctl enable --now {paths.NAME}@{name}\n"
+            f"to replace {installed_name}, remove {paths.PACK_FILE} first"
         )
 
 
@@ -206,8 +206,8 @@ def _pack_name(settings: bytes) -> str | None:
 
 def _write_settings(machine: Machine, pack: PackFiles, group: int, report: Report) -> None:
     """Copy a pack file and the files that it names. Back up each installed file that differs."""
-    files = {places.SETTINGS / file.name: read_file(file) for file in pack.named}
-    files[places.PACK_FILE] = pack.settings.read_bytes()
+    files = {paths.SETTINGS / file.name: read_file(file) for file in pack.named}
+    files[paths.PACK_FILE] = pack.settings.read_bytes()
     for name, content in files.items():
         installed = machine.read(name)
         if installed is not None and installed != content:
@@ -220,7 +220,7 @@ def _write_settings(machine: Machine, pack: PackFiles, group: int, report: Repor
 
 def _set_settings_group(machine: Machine, group: int) -> None:
     """Set the group of all settings. After a new installation the group may have another id."""
-    folder = machine.path(places.SETTINGS)
+    folder = machine.path(paths.SETTINGS)
     folder.mkdir(mode=0o755, parents=True, exist_ok=True)
     for path in tree(folder):
         os.chown(path, -1, group, follow_symlinks=False)
@@ -228,8 +228,8 @@ def _set_settings_group(machine: Machine, group: int) -> None:
 
 def _is_enabled(machine: Machine) -> bool:
     """Return True if the service starts with the machine."""
-    folders = machine.path(places.UNIT).parent.glob("*.wants")
-    return any((folder / places.UNIT.name).is_symlink() for folder in folders)
+    folders = machine.path(paths.UNIT).parent.glob("*.wants")
+    return any((folder / paths.UNIT.name).is_symlink() for folder in folders)
 
 
 def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
@@ -246,16 +246,16 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
     Raises:
         UserError: A program of the system is missing or fails.
     """
-    all_units = places.UNIT, places.TEMPLATE
+    all_units = paths.UNIT, paths.TEMPLATE
     units = [unit for unit in all_units if machine.path(unit).exists()]
     if units:
         if machine.has_running_systemd:
-            run(["systemctl", "stop", places.UNIT.name, OTHER_PACKS])
+            run(["systemctl", "stop", paths.UNIT.name, OTHER_UNITS])
         machine.run("systemctl", "disable", "--quiet", *(unit.name for unit in units))
         report("service", "stopped and disabled")
-    drop_ins = [places.drop_ins(unit) for unit in all_units]
-    user_data = [*drop_ins, places.SETTINGS, places.STATE]
-    for name in (*all_units, *map(places.clock_drop_in, all_units), places.UDEV_RULE, places.CACHE):
+    drop_ins = [paths.drop_ins(unit) for unit in all_units]
+    user_data = [*drop_ins, paths.SETTINGS, paths.STATE]
+    for name in (*all_units, *map(paths.clock_drop_in, all_units), paths.UDEV_RULE, paths.CACHE):
         _remove(machine, name, report)
     for name in user_data if purge else ():
         _remove(machine, name, report)
@@ -266,15 +266,14 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
     for name in user_data:
         _give_to_root(machine.path(name))
     _remove_user(machine, report)
-    if machine.path(places.PROGRAM_LINK).is_symlink():
-        _remove(machine, places.PROGRAM_LINK, report)
-    if is_program_copy(machine.path(places.PROGRAM_COPY)):
-        _remove(machine, places.PROGRAM_COPY, report)
+    if machine.path(paths.PROGRAM_LINK).is_symlink():
+        _remove(machine, paths.PROGRAM_LINK, report)
+    if is_program_copy(machine.path(paths.PROGRAM_COPY)):
+        _remove(machine, paths.PROGRAM_COPY, report)
     return [name for name in user_data if machine.path(name).exists()]
 
 
 def _remove(machine: Machine, name: Path, report: Report) -> None:
-    """Remove a file or a folder, if it exists."""
     path = machine.path(name)
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
@@ -287,13 +286,13 @@ def _remove(machine: Machine, name: Path, report: Report) -> None:
 
 def _remove_user(machine: Machine, report: Report) -> None:
     """Remove the user and its group. Whether ``userdel`` also removes the group depends on the distribution."""
-    if machine.group_id(places.NAME) is None:
+    if machine.group_id(paths.NAME) is None:
         return
     # with --root, userdel would run in a chroot and need the libraries of the image
-    machine.run("userdel", places.NAME, root_option="--prefix")
-    if machine.group_id(places.NAME) is not None:
-        machine.run("groupdel", places.NAME, root_option="--prefix")
-    report("removed", f"user {places.NAME}")
+    machine.run("userdel", paths.NAME, root_option="--prefix")
+    if machine.group_id(paths.NAME) is not None:
+        machine.run("groupdel", paths.NAME, root_option="--prefix")
+    report("removed", f"user {paths.NAME}")
 
 
 def _remove_if_empty(folder: Path) -> None:

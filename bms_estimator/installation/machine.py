@@ -9,7 +9,7 @@ from pathlib import Path
 
 from bms_estimator.model.errors import UserError
 
-_LINK = "{}: is a symbolic link, which may lead to another user's file; replace it with the file"
+_LINK_ERROR = "{}: is a symbolic link, which may lead to another user's file; replace it with the file"
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Machine:
         """
         path = self.path(name)
         if path.is_symlink():
-            raise UserError(_LINK.format(path))
+            raise UserError(_LINK_ERROR.format(path))
         new = path.with_name(f".{path.name}.new")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +109,7 @@ def read_file(path: Path) -> bytes:
             return file.read()
     except OSError as error:
         raise UserError(
-            _LINK.format(path) if error.errno == errno.ELOOP else f"{path}: cannot be read: {error.strerror}"
+            _LINK_ERROR.format(path) if error.errno == errno.ELOOP else f"{path}: cannot be read: {error.strerror}"
         ) from None
 
 

@@ -54,7 +54,7 @@ def _paths_in(settings: Settings) -> Iterator[tuple[str, Path]]:
 
 
 def _paths_of_section(prefix: str, section: BaseModel) -> Iterator[tuple[str, Path]]:
-    """Yield key and path of each file that a section, or a section in it, may name."""
+    """Yield key and path of each file that a section or one of its subsections may name."""
     for key in type(section).model_fields:
         value = getattr(section, key)
         if isinstance(value, Path):

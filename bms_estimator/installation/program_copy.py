@@ -1,4 +1,4 @@
-"""Copy of this program and the packages that it requires, in a virtual environment of its own."""
+"""Copy of this program and the packages that it requires, in a separate virtual environment."""
 
 import re
 import shutil
@@ -83,7 +83,7 @@ def copy_program(target: Path, *, installed_as: Path, python: Path) -> None:
         python: Interpreter of the environment.
 
     Raises:
-        UserError: The folder exists, and is no copy.
+        UserError: The folder exists, and is not a copy of this program.
     """
     if target.exists() and not is_program_copy(target):
         raise UserError(
@@ -105,7 +105,7 @@ def required_packages(program: Distribution, extras: Iterable[str]) -> list[Dist
 
     Args:
         program: The program.
-        extras: Extras of the program whose packages are included, as far as they are installed.
+        extras: Extras of the program whose installed packages are included.
     """
     packages: dict[str, Distribution] = {}
     pending = list(_requirements(program, set(extras)))
@@ -125,7 +125,7 @@ def required_packages(program: Distribution, extras: Iterable[str]) -> list[Dist
 
 
 def _requirements(package: Distribution, extras: set[str]) -> Iterator[tuple[str, frozenset[str]]]:
-    """Yield name and extras of each requirement of a package that applies with the given extras of the package."""
+    """Yield name and extras of each requirement that a package has with the given extras."""
     for line in package.requires or []:
         requirement, _, marker = line.partition(";")
         extra = _EXTRA.search(marker)
@@ -137,7 +137,7 @@ def _requirements(package: Distribution, extras: set[str]) -> Iterator[tuple[str
 def copy_packages(packages: Iterable[Distribution], site_packages: Path) -> None:
     """Copy the files of installed packages to the same places in another environment.
 
-    Programs such as nats-server and compiled Python files are copied, scripts are not: they name their interpreter.
+    Programs such as nats-server and compiled Python files are copied. Scripts are not, because they name their interpreter.
     """
     for package in packages:
         for file in package.files or []:

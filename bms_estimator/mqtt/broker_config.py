@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.systemd import credential
+from bms_estimator.process.systemd import credential_path
 from bms_estimator.settings.broker import BrokerSettings
 
 PORTS = {"mqtt": 1883, "mqtts": 8883}
@@ -57,7 +57,7 @@ def password(settings: BrokerSettings) -> str | None:
         return None
     section = settings.section
     try:
-        return credential(settings.password_file).read_text(encoding="utf-8").rstrip("\r\n")
+        return credential_path(settings.password_file).read_text(encoding="utf-8").rstrip("\r\n")
     except OSError as error:
         raise TemporaryError(
             f"{section}.password_file = {settings.password_file}: cannot be read: {error.strerror}"
@@ -105,7 +105,7 @@ def check(settings: BrokerSettings) -> list[str]:
     return [
         f"{settings.section}.{key} = {name}: every user of this machine may read it; take that away with chmod o-r"
         for key, name in files.items()
-        if name is not None and credential(name).exists() and credential(name).stat().st_mode & 0o004
+        if name is not None and credential_path(name).exists() and credential_path(name).stat().st_mode & 0o004
     ]
 
 
@@ -136,13 +136,13 @@ def _load_client_certificate(context: ssl.SSLContext, settings: BrokerSettings, 
     # load_cert_chain does not name the file that it cannot read
     for name, path in (("cert_file", cert_file), ("key_file", key_file)):
         try:
-            credential(path).read_bytes()
+            credential_path(path).read_bytes()
         except OSError as error:
             raise TemporaryError(f"{section}.{name} = {path}: cannot be read: {error.strerror}") from None
     try:
         # without a password callback, OpenSSL would prompt on the terminal
         context.load_cert_chain(
-            credential(cert_file), credential(key_file), password=partial(_refuse_password, section)
+            credential_path(cert_file), credential_path(key_file), password=partial(_refuse_password, section)
         )
     except ssl.SSLError as error:
         if error.reason == "KEY_VALUES_MISMATCH":

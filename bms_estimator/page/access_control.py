@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import TemporaryError
-from bms_estimator.process.systemd import credential
+from bms_estimator.process.systemd import credential_path
 from bms_estimator.settings.page import PageSettings
 
 MIN_TOKEN_CHARACTERS = 16
@@ -82,7 +82,7 @@ def _token(settings: PageSettings) -> str | None:
     if name is None:
         return None
     try:
-        token = credential(name).read_text(encoding="utf-8").strip()
+        token = credential_path(name).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise TemporaryError(f"page.token_file = {name}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:  # the text of the error would show bytes of the token

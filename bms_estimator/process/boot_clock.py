@@ -1,4 +1,4 @@
-"""Timestamps that remain comparable across restarts, for the length of gaps without samples."""
+"""Timestamps that remain comparable across restarts. They give the length of a gap without samples."""
 
 import ctypes
 import math
@@ -23,7 +23,7 @@ class BootTimestamp:
     """Timestamp that can be compared after a restart of the process, and after a reboot if the wall clock was right.
 
     Attributes:
-        wall_s: Wall clock [s since 1970]. A clock without a battery stops while the machine is off.
+        wall_s: Wall clock [s since 1970]. It stops while a machine without a clock battery is off.
         synchronised: True if the wall clock is synchronized.
         boot_s: Time since the machine started, including suspend [s].
         boot: Identifier of the boot; empty if unknown.
@@ -42,7 +42,7 @@ class BootTimestamp:
         return passed_s if passed_s >= 0.0 and self.synchronised and before.synchronised else math.inf
 
 
-def synchronised() -> bool:
+def is_clock_synchronized() -> bool:
     """Return True if the wall clock counts as synchronized.
 
     The kernel reports it, or systemd-timesyncd if the kernel must not be queried.
@@ -60,7 +60,7 @@ def boot_timestamp() -> BootTimestamp:
     boot = os.environ.get("BMS_BOOT_ID") or (BOOT_ID.read_text(encoding="ascii") if BOOT_ID.exists() else "")
     return BootTimestamp(
         wall_s=time.time(),
-        synchronised=synchronised(),
+        synchronised=is_clock_synchronized(),
         boot_s=since_boot(),
         boot=boot.strip().replace("-", ""),
     )

@@ -57,7 +57,7 @@ def is_locked(folder: Path, pack: str) -> bool:
 
     The list of sockets is read instead of connecting, because a connection would stay in the queue of the holder.
     """
-    name = _name(folder, pack).replace("\0", "@")
+    name = _socket_name(folder, pack).replace("\0", "@")
     with contextlib.suppress(OSError):
         return any(line.endswith(f" {name}") for line in SOCKETS.read_text(encoding="utf-8").splitlines())
     return False
@@ -70,7 +70,7 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
         TemporaryError: A service has the name.
         OSError: The system rejects the name.
     """
-    name, process_id = _name(folder, pack), None
+    name, process_id = _socket_name(folder, pack), None
     for _ in range(ATTEMPTS):
         try:
             lock.bind(name)
@@ -98,7 +98,7 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
     )
 
 
-def _name(folder: Path, pack: str) -> str:
+def _socket_name(folder: Path, pack: str) -> str:
     """Return the name of the lock, a hash within the length limit of socket names."""
     real_folder = os.path.realpath(folder)
     return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{real_folder}/{pack}')).hexdigest()[:32]}"

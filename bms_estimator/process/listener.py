@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import structlog
 
-HEADER_S = 10.0
+HEADER_TIMEOUT_S = 10.0
 """Deadline from the connection to a complete request header [s]."""
-IDLE_S = 30.0
+IDLE_TIMEOUT_S = 30.0
 """Deadline from the end of a response to the next complete request header [s]."""
 MAX_CONNECTIONS = 256
 """Maximum number of connections of all listeners of the process."""
@@ -22,9 +22,9 @@ ADDRESS_FRACTION = 0.5
 """Fraction of the connections that one client address may hold."""
 BACKLOG = 128
 """Maximum number of connections that wait to be accepted."""
-LOG_S = 60.0
+LOG_INTERVAL_S = 60.0
 """Minimum time between two log lines on failed accepts [s]."""
-RETRY_S = 1.0
+ACCEPT_RETRY_S = 1.0
 """Delay after a failed accept [s]."""
 OPEN_RETRY_S = 10.0
 """Retry interval of an address that cannot be listened on [s]."""
@@ -50,7 +50,7 @@ class _Connection:
     serving: bool = False
     """True while a request is handled."""
     unsent: int = 0
-    """Bytes of a response that waited for the client when the deadline was last set."""
+    """Unsent bytes of the response when the deadline was last set."""
 
     @property
     def is_busy(self) -> bool:
@@ -71,25 +71,25 @@ class Connections:
     def __init__(self, limit: int | None = None) -> None:
         self.limit = limit or _default_limit()
         self._address_limit = max(1, int(ADDRESS_FRACTION * self.limit))
-        self._open: dict[asyncio.BaseTransport, _Connection] = {}
+        self._by_transport: dict[asyncio.BaseTransport, _Connection] = {}
 
     def __len__(self) -> int:
         """Return the number of open connections."""
         self._prune()
-        return len(self._open)
+        return len(self._by_transport)
 
     def add(self, client_socket: socket.socket, transport: asyncio.Transport, address: str) -> None:
         """Add a connection and start the deadline of its first request; close it if the limits do not allow it."""
         if not self._make_room(address):
             transport.abort()
             return
-        deadline = asyncio.get_running_loop().call_later(HEADER_S, transport.abort)
-        self._open[transport] = _Connection(client_socket, transport, address, deadline)
+        deadline = asyncio.get_running_loop().call_later(HEADER_TIMEOUT_S, transport.abort)
+        self._by_transport[transport] = _Connection(client_socket, transport, address, deadline)
 
     @contextlib.contextmanager
     def serving(self, transport: asyncio.BaseTransport | None) -> Iterator[None]:
         """Exempt a connection from deadline and displacement while its request is handled."""
-        connection = self._open.get(transport) if transport else None
+        connection = self._by_transport.get(transport) if transport else None
         if connection is None:
             yield
             return
@@ -99,28 +99,28 @@ class Connections:
             yield
         finally:
             connection.serving = False
-            self._wait(connection)
+            self._start_deadline(connection)
 
-    def _wait(self, connection: _Connection) -> None:
+    def _start_deadline(self, connection: _Connection) -> None:
         """Start the deadline of the next request, or of the response that is being sent."""
         connection.unsent = connection.transport.get_write_buffer_size()
-        connection.deadline = asyncio.get_running_loop().call_later(IDLE_S, self._expire, connection)
+        connection.deadline = asyncio.get_running_loop().call_later(IDLE_TIMEOUT_S, self._expire, connection)
 
     def _expire(self, connection: _Connection) -> None:
         """Close a connection, unless its client has read a part of the response since the deadline was set."""
         unsent = connection.transport.get_write_buffer_size()
         if unsent and (not connection.unsent or unsent < connection.unsent):
-            self._wait(connection)
+            self._start_deadline(connection)
         else:
             connection.transport.abort()
 
     def _make_room(self, address: str) -> bool:
         """Return True if an address may have one more connection; close an idle one if necessary."""
         self._prune()
-        own = [each for each in self._open.values() if each.address == address]
+        own = [each for each in self._by_transport.values() if each.address == address]
         if len(own) >= self._address_limit:
             return self._displace(own)
-        return len(self._open) < self.limit or self._displace(list(self._open.values()))
+        return len(self._by_transport) < self.limit or self._displace(list(self._by_transport.values()))
 
     def _displace(self, candidates: list[_Connection]) -> bool:
         idle = next((each for each in candidates if not each.is_busy), None)
@@ -132,13 +132,13 @@ class Connections:
 
     def _prune(self) -> None:
         """Remove the connections whose descriptor is closed."""
-        for each in list(self._open.values()):
+        for each in list(self._by_transport.values()):
             if each.client_socket.fileno() < 0:
                 self._drop(each)
 
     def _drop(self, connection: _Connection) -> None:
         connection.deadline.cancel()
-        del self._open[connection.transport]
+        del self._by_transport[connection.transport]
 
 
 CONNECTIONS = Connections()
@@ -161,7 +161,7 @@ class Listener:
         self._connecting: set[asyncio.Task[None]] = set()
         self._resuming: dict[socket.socket, asyncio.TimerHandle] = {}
         self._opening: asyncio.Task[None] | None = None
-        self._log_time_s = -LOG_S
+        self._log_time_s = -LOG_INTERVAL_S
 
     async def open(self, host: str, port: int) -> int:
         """Listen and return the port.
@@ -190,7 +190,7 @@ class Listener:
             host: Address.
             port: Port.
             name: Name of the service in the log.
-            on_open: Called with the port once the address is listened on.
+            on_open: Called with the port once the address is listened on. The default has no effect.
         """
         try:
             on_open(await self.open(host, port))
@@ -237,10 +237,10 @@ class Listener:
         task.add_done_callback(self._connecting.discard)
 
     def _pause(self, listening: socket.socket) -> None:
-        """Accept no connection for ``RETRY_S``, because the event loop would call ``_accept`` all the time."""
+        """Accept no connection for ``ACCEPT_RETRY_S``, because the event loop would call ``_accept`` all the time."""
         loop = asyncio.get_running_loop()
         loop.remove_reader(listening)
-        self._resuming[listening] = loop.call_later(RETRY_S, self._resume, listening)
+        self._resuming[listening] = loop.call_later(ACCEPT_RETRY_S, self._resume, listening)
 
     def _resume(self, listening: socket.socket) -> None:
         self._resuming.pop(listening, None)
@@ -262,7 +262,7 @@ class Listener:
 
     def _log_failure(self, error: OSError) -> None:
         now_s = time.monotonic()
-        if now_s >= self._log_time_s + LOG_S:
+        if now_s >= self._log_time_s + LOG_INTERVAL_S:
             self._log_time_s = now_s
             log.warning("connections cannot be accepted", reason=error.strerror)
 

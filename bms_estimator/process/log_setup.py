@@ -49,7 +49,7 @@ def configure_logs(lines: MutableSequence[str] | None = None) -> None:
             structlog.processors.TimeStamper(fmt="iso" if to_stderr else "%H:%M:%SZ", utc=True),
             *renderers,
         ],
-        logger_factory=lambda *_: _LineLogger(stderr.take if lines is None else lines.append),
+        logger_factory=lambda *_: _LineLogger(stderr.put if lines is None else lines.append),
     )
 
 

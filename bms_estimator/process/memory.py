@@ -15,10 +15,10 @@ def anonymous_bytes() -> int:
 
 
 def available_bytes() -> int:
-    """Return the memory that programs can use without swapping, on the machine and in each control group of this process [bytes]."""
+    """Return the memory that this process can use without swapping, within the limits of machine and control groups [bytes]."""
     try:
         machine = _kib_of(Path("/proc/meminfo"), "MemAvailable") * 1024
-    except FileNotFoundError:  # ProcSubset=pid of a systemd unit hides the file
+    except FileNotFoundError:  # ProcSubset=pid of a systemd unit hides the file; half of the RAM counts as available
         machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
     return max(0, min([machine, *_available_in_groups()]))
 
@@ -42,12 +42,13 @@ def _available_in_groups() -> Iterator[int]:
     for line in Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines():
         _, controllers, path = line.split(":", 2)
         if controllers == "":
-            yield from _available_below(CGROUPS, path, "memory.max", "anon")
+            yield from _available_in_parents(CGROUPS, path, "memory.max", "anon")
         elif "memory" in controllers.split(","):
-            yield from _available_below(CGROUPS / "memory", path, "memory.limit_in_bytes", "total_rss")
+            yield from _available_in_parents(CGROUPS / "memory", path, "memory.limit_in_bytes", "total_rss")
 
 
-def _available_below(root: Path, path: str, limit_file: str, used: str) -> Iterator[int]:
+def _available_in_parents(root: Path, path: str, limit_file: str, used: str) -> Iterator[int]:
+    """Yield limit less use of the group ``path`` and of each of its parents that has a limit [bytes]."""
     group = root / path.lstrip("/")
     for folder in (group, *group.parents):
         if folder.is_relative_to(root):

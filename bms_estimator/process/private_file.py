@@ -58,7 +58,7 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
 
 
 def overwrite_private(path: Path, content: bytes) -> None:
-    """Overwrite an existing file in place, and sync it to disk. It needs no free space unless the content grows by a block.
+    """Overwrite an existing file in place, and sync it to disk. This needs no free space unless the content grows by a block.
 
     Raises:
         OSError: The file is missing, a symbolic link, or cannot be written. Its content may be damaged.

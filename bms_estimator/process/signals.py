@@ -1,4 +1,4 @@
-"""Clean end of a long-running process by a signal."""
+"""Signals of a long-running process: clean shutdown, and acknowledgement of alarms."""
 
 import asyncio
 import contextlib
@@ -30,7 +30,7 @@ def stop_on_signal(stop: asyncio.Event | None = None) -> asyncio.Event:
 
 @contextlib.contextmanager
 def acknowledge_on_signal(acknowledge: Callable[[], object]) -> Iterator[None]:
-    """Call a function on SIGUSR1, as well as those of the other packs of this process."""
+    """Call a function on SIGUSR1, in addition to the functions of other packs of this process."""
     _acknowledges.append(acknowledge)
     asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, _acknowledge_all)
     try:
@@ -45,7 +45,7 @@ def _acknowledge_all() -> None:
 
 
 @contextlib.contextmanager
-def startup_signals() -> Iterator[None]:
+def exit_on_startup_signals() -> Iterator[None]:
     """Exit with code 0 on SIGTERM or SIGHUP until an event loop handles them. There is no state to save yet.
 
     An ignored SIGHUP stays ignored, as under nohup.
@@ -62,7 +62,7 @@ def startup_signals() -> Iterator[None]:
 def _end(*_: object) -> None:
     """End the process without an exception, because an exception may be lost in numba's compiler.
 
-    The end runs in a thread, because the interrupted code may hold the lock of the log.
+    The exit runs in a thread, because the interrupted code may hold the lock of the log.
     """
 
     def end() -> None:

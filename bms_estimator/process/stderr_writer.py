@@ -26,7 +26,7 @@ class Stderr:
         self._lock = threading.Lock()
         self.lost = 0
 
-    def take(self, line: str) -> None:
+    def put(self, line: str) -> None:
         """Queue a line; callable from any thread, never blocking."""
         try:
             self._lines.put_nowait(line)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 CREDENTIALS = Path("/run/credentials")
 """Folder with the credentials of all systemd units."""
-EXTENSION_S = 120
+START_EXTENSION_S = 120
 """Extension of the start timeout [s]."""
 
 
@@ -29,7 +29,7 @@ class SystemdNotifier:
         self, packs: Collection[str], environment: Mapping[str, str] = os.environ, *, activity: str = "estimating"
     ) -> None:
         self._packs, self._activity = frozenset(packs), activity
-        self._awaited: dict[str, set[str]] = {}
+        self._awaited: dict[str, set[str]] = {}  # packs that have yet to report, by state
         self._texts = dict.fromkeys(packs, "")
         self._socket = environment.get("NOTIFY_SOCKET", "")
         is_watched = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
@@ -68,8 +68,8 @@ class SystemdNotifier:
 
 
 def extend_start(status: str) -> None:
-    """Extend the start timeout of the systemd unit by ``EXTENSION_S``, and set its status text."""
-    _send(os.environ.get("NOTIFY_SOCKET", ""), f"EXTEND_TIMEOUT_USEC={EXTENSION_S * 10**6}\nSTATUS={status}")
+    """Extend the start timeout of the systemd unit by ``START_EXTENSION_S``, and set its status text."""
+    _send(os.environ.get("NOTIFY_SOCKET", ""), f"EXTEND_TIMEOUT_USEC={START_EXTENSION_S * 10**6}\nSTATUS={status}")
 
 
 def _send(address: str, state: str) -> None:
@@ -81,16 +81,16 @@ def _send(address: str, state: str) -> None:
         channel.sendto(state.encode(), "\0" + address[1:] if address.startswith("@") else address)
 
 
-def credential(name: Path) -> Path:
+def credential_path(name: Path) -> Path:
     """Return the path of this file name in ``$CREDENTIALS_DIRECTORY`` if it exists there, else ``name`` itself."""
     path = Path(os.environ.get("CREDENTIALS_DIRECTORY", ""), name)
     return path if os.access(path, os.R_OK) else name
 
 
-def is_for_the_service(name: Path) -> bool:
+def is_unreadable_credential(name: Path) -> bool:
     """Return True if ``name`` is the name or path of a systemd credential that this process cannot read.
 
     The service may be able to read it.
     """
     is_credential = not name.is_absolute() or name.is_relative_to(CREDENTIALS)
-    return is_credential and not os.access(credential(name), os.R_OK)
+    return is_credential and not os.access(credential_path(name), os.R_OK)

@@ -1,4 +1,4 @@
-"""Alarm hooks: actions when an alarm is raised or ends. Each hook runs in a task of its own and delays nothing else."""
+"""Alarm hooks: actions when an alarm is raised or ends. Each hook runs in its own task and delays nothing else."""
 
 import asyncio
 import hashlib
@@ -15,7 +15,7 @@ from bms_estimator.service.relay_hook import RelayBoard, RelayHook
 from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.telemetry.alarms.message import Change
 
-CLOSE_S = 2.0
+CLOSE_TIMEOUT_S = 2.0
 """Timeout of running hooks at shutdown [s]."""
 
 
@@ -30,7 +30,7 @@ class AlarmHooks:
         clock: Time since boot of the host [s].
 
     Attributes:
-        is_watching: Returns True once due alarms would be raised (``AlarmMonitor.check_silence``).
+        is_watching: Returns True once enough samples have arrived to raise all due alarms (``AlarmMonitor.check_silence``).
 
     Raises:
         UserError: A hook needs something that is missing.
@@ -71,11 +71,11 @@ class AlarmHooks:
     def on_alarm_change(self, change: Change) -> None:
         """Pass a change of an alarm to its hooks; returns at once."""
         for hook in self._hooks:
-            if hook.covers(change.alarm.name):
+            if hook.applies_to(change.alarm.name):
                 hook.on_alarm_change(change.alarm)
 
     def stop_watching(self) -> None:
-        """Send no more relay level without an alarm, because the alarms are no longer evaluated."""
+        """Stop setting relays to their level without an alarm, because the alarms are no longer evaluated."""
         for hook in self._hooks:
             hook.has_watched = False
         self.is_watching = lambda: False
@@ -86,26 +86,26 @@ class AlarmHooks:
         return [_hash(hook.settings) for hook in self._hooks if not (hook.is_busy or hook.error)]
 
     def restore_active(
-        self, alarms: Sequence[Alarm], known: Collection[str] | None = None, *, crashed: bool = False
+        self, alarms: Sequence[Alarm], finished: Collection[str] | None = None, *, crashed: bool = False
     ) -> None:
         """Restore the alarms of an earlier run.
 
-        Jobs of these alarms are not repeated, but the relay is set to its level. A hook that the earlier run did not have, or
-        whose jobs were not finished, gets its jobs. If a hook had failed in the earlier run, all jobs are repeated, so that
+        Jobs of these alarms are not repeated, but the relay is set to its level. A hook that is new, or whose jobs
+        were not finished, runs its jobs. If a hook had failed in the earlier run, all jobs are repeated, so that
         none is lost.
 
         Args:
             alarms: All alarms.
-            known: ``finished_hashes`` at the end of the earlier run; None: no hook counts as new.
+            finished: ``finished_hashes`` at the end of the earlier run; None: no hook counts as new.
             crashed: True if the earlier run crashed or was killed, perhaps with unfinished jobs. All jobs are repeated.
         """
         raised = [alarm for alarm in alarms if counts_as_raised(alarm)]
         failed = [alarm for alarm in raised if alarm.name == "hook_failed"]
         for hook in self._hooks:
-            is_unfinished = crashed or (known is not None and _hash(hook.settings) not in known)
+            is_unfinished = crashed or (finished is not None and _hash(hook.settings) not in finished)
             if failed or is_unfinished:
                 for alarm in raised:  # a finished hook does not announce hook_failed again
-                    if (is_unfinished or alarm not in failed) and hook.covers(alarm.name):
+                    if (is_unfinished or alarm not in failed) and hook.applies_to(alarm.name):
                         hook.on_alarm_change(alarm)
                 hook.restore_active(failed)
             else:
@@ -117,19 +117,19 @@ class AlarmHooks:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Wait up to ``CLOSE_S`` for running programs."""
+        """Wait up to ``CLOSE_TIMEOUT_S`` for running programs."""
         for hook in self._hooks:
             hook.close()
         if self._tasks:
-            _, late = await asyncio.wait(self._tasks, timeout=CLOSE_S)
+            _, late = await asyncio.wait(self._tasks, timeout=CLOSE_TIMEOUT_S)
             for task in late:
                 task.cancel()
             await asyncio.gather(*late, return_exceptions=True)
 
 
 def _hash(hook: AlarmHook) -> str:
-    """Return a hash of the settings that differ from the defaults, which a later version with more settings reproduces.
+    """Return a hash of the settings that differ from the defaults, so that a later version with more settings returns the same.
 
-    A hash, because a hook's arguments may hold secrets.
+    The settings are hashed because a hook's arguments may hold secrets.
     """
     return hashlib.sha256(hook.model_dump_json(exclude_defaults=True).encode()).hexdigest()[:16]

@@ -23,7 +23,7 @@ from bms_estimator.telemetry.cells import cell_alarm_inputs
 if TYPE_CHECKING:
     from bms_estimator.estimator.cell_estimator import CellDeviations
 
-EVALUATION_S = 0.1
+EVALUATION_INTERVAL_S = 0.1
 """Minimum interval between two reports of changes, and between two evaluations of silence, resets and hooks [s]."""
 
 log = structlog.get_logger(__name__)
@@ -60,7 +60,7 @@ class AlarmMonitor:
         hooks: Callable[[], HookHealth | None] = lambda: None,
     ) -> None:
         self._pack, self._hooks = pack, hooks
-        self._cells_seen: CellDeviations | None = None  # evaluated last
+        self._cells_seen: CellDeviations | None = None  # the deviations that were evaluated last
         self._board_resets = BoardResets()
         self._relay_resets = 0  # number of resets that undid a relay level, at the last evaluation
         self._estimator, self._source, self._clock, self._on_alarm = pack.estimator, source, clock, on_alarm
@@ -95,12 +95,12 @@ class AlarmMonitor:
                 probes=received.probes,
                 cells_fault=cells_fault,
                 clock_fault=self._source.clock_fault,
-                lost=self._lost,
+                lost=self._lost_samples,
                 cell_alarm_inputs=cell_alarm_inputs(cells) if cells is not None and is_new else None,
                 weak_cell_std=slow_fit.weak_cell_std if slow_fit else math.nan,
             )
         self._last_sample_s = now_s
-        return now_s - self._evaluated_s >= EVALUATION_S and self.evaluate(now_s)
+        return now_s - self._evaluated_s >= EVALUATION_INTERVAL_S and self.evaluate(now_s)
 
     def evaluate(self, now_s: float) -> bool:
         """Evaluate silence, resets of the board and hooks, and report all changes; no effect after ``stop``.
@@ -124,19 +124,19 @@ class AlarmMonitor:
         return self._report_changes()
 
     def check_silence(self) -> bool:
-        """Evaluate the time since the last sample, before a sample or a relay command that follows a suspend hides it.
+        """Evaluate the time since the last sample. Call this before samples or a relay command, so that no suspend is missed.
 
         Returns:
-            True once due alarms would be raised (``AlarmEvaluator.is_watching``).
+            True once enough samples have arrived to raise all due alarms (``AlarmEvaluator.is_watching``).
         """
         now_s = self._clock.monotonic()
-        if now_s - self._evaluated_s >= EVALUATION_S:
+        if now_s - self._evaluated_s >= EVALUATION_INTERVAL_S:
             self._evaluate_silence(now_s)
             self._report_changes()
         return self.alarms.is_watching
 
     def stop(self) -> None:
-        """Change no alarm from now on. The final save would lack the change, although hooks have reported it."""
+        """Stop changing alarms, because the final save would lack a change that hooks have reported."""
         self._is_stopped = True
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
@@ -173,7 +173,7 @@ class AlarmMonitor:
 
     def raise_state_lost(self, reason: str) -> None:
         """Raise ``alarm_state_lost``, and pass it to the callback."""
-        self.alarms.raise_state_lost(reason, self._clock.wall(), self._measured)
+        self.alarms.raise_state_lost(reason, self._clock.wall(), self._measured_counts)
         self._report_changes()
 
     def _evaluate_silence(self, now_s: float) -> None:
@@ -181,8 +181,8 @@ class AlarmMonitor:
         self.alarms.on_silence(now_s - self._last_sample_s, self._clock.wall(), reason, now_s)
 
     @property
-    def _measured(self) -> dict[Quantity, int]:
-        """Number of values in a sample by quantity, as far as the state of the estimators shows that they were measured."""
+    def _measured_counts(self) -> dict[Quantity, int]:
+        """Number of values in a sample by quantity, for the quantities that the estimators have received."""
         if not self._estimator.state["started"][0]:
             return {}
         measured: dict[Quantity, int] = {"voltage": 1, "current": 1}
@@ -193,13 +193,13 @@ class AlarmMonitor:
         return measured
 
     @property
-    def _lost(self) -> int:
+    def _lost_samples(self) -> int:
         """Number of samples that were lost on the line.
 
-        The larger one of lost frames and errors counts, because a damaged frame is also missing in the sequence of frames.
+        The larger of lost frames and errors counts, because a damaged frame is also missing in the sequence of frames.
         """
-        line = self._source.counters
-        return max(line.get("frames_lost", 0), sum(n for name, n in line.items() if name.endswith("_errors")))
+        counters = self._source.counters
+        return max(counters.get("frames_lost", 0), sum(n for name, n in counters.items() if name.endswith("_errors")))
 
     def _report_changes(self) -> bool:
         """Update the report, log all new changes and pass them to the callback. Return True if there are any."""

@@ -29,18 +29,18 @@ from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals
 
 SOC_CHANGE = 0.002
 """Change of the SOC that triggers a save. If the service is killed, no larger change is lost."""
-CHECK_S = 1.0
+CHECK_INTERVAL_S = 1.0
 """Interval of the check for a change of the SOC or an acknowledgement [s]. A raised alarm is saved at once."""
 DISK_HUNG_S = 10.0
 """Time after which a disk that has not completed a write counts as hung [s]."""
-ALARM_SAVE_S = 30.0
-"""Minimum interval before a save for an alarm that only ended, so that a flapping alarm does not wear the disk [s]. A kill
+ALARM_SAVE_INTERVAL_S = 30.0
+"""Minimum interval between saves if alarms have only ended, so that a flapping alarm does not wear the disk [s]. A kill
 within this time raises the alarm again at the next start."""
 RETRY_S = 10.0
 """Interval between retries of a failed save of the alarms [s]."""
-LOAD_SAVE_S = 300.0
+LOAD_SAVE_INTERVAL_S = 300.0
 """Interval between two saves of the observed load [s]. A crash loses at most the load of this time."""
-FINAL_SAVE_S = 20.0
+FINAL_SAVE_TIMEOUT_S = 20.0
 """Timeout of the save at shutdown [s]. A busy SD card may take several seconds. systemd waits 90 s before it kills a service."""
 
 T = TypeVar("T")
@@ -49,14 +49,14 @@ log = structlog.get_logger(__name__)
 
 
 class CheckpointWriter:
-    """Saves the estimator's state in a thread of its own, so that a slow disk delays nothing else.
+    """Saves the estimator's state in a separate thread, so that a slow disk delays nothing else.
 
     Args:
         pack: The pack; read only.
         files: Files of the state. The history is saved when the ``revision`` of the slow fit changes, and the observed load
-            every ``LOAD_SAVE_S``.
+            every ``LOAD_SAVE_INTERVAL_S``.
         alarms: Monitor of the alarms.
-        totals: Totals over restarts.
+        totals: Lifetime totals.
         hooks: Alarm hooks; read only.
         slots: Cell slots of the source; read only.
         status: Receives the outcome of each save.
@@ -91,25 +91,28 @@ class CheckpointWriter:
     async def run(self) -> None:
         """Save at each interval, and earlier after the first sample, a change of the SOC, or a raised alarm."""
         loop = asyncio.get_running_loop()
-        tried_s, failed, load_tried_s = -math.inf, False, loop.time()
+        state_tried_s, failed, load_tried_s = -math.inf, False, loop.time()
         # until the final save marks the run as clean, the next start counts it as crashed
-        run_failures, run_tried_s = 0 if await self._save_counters() else 1, loop.time()
-        if run_failures:
+        run_file_failures, run_file_tried_s = 0 if await self._save_counters() else 1, loop.time()
+        if run_file_failures:
             self._raise_state_lost()
         while True:
-            await self._wait_for_alarm(min(CHECK_S, self._interval_s))
-            run_delay_s = RETRY_S if run_failures else self._delay_of_counters_s
-            if not run_failures and await self._is_run_file_missing():
-                self._saved_counters, run_delay_s = None, 0.0
-            if loop.time() >= run_tried_s + run_delay_s:
-                run_failures, run_tried_s = 0 if await self._save_counters() else run_failures + 1, loop.time()
-                if run_failures > 1 and self._lacks_alarm:  # the cause of a single failure may pass
+            await self._wait_for_alarm(min(CHECK_INTERVAL_S, self._interval_s))
+            run_file_delay_s = RETRY_S if run_file_failures else self._delay_of_counters_s
+            if not run_file_failures and await self._is_run_file_missing():
+                self._saved_counters, run_file_delay_s = None, 0.0
+            if loop.time() >= run_file_tried_s + run_file_delay_s:
+                run_file_failures, run_file_tried_s = (
+                    0 if await self._save_counters() else run_file_failures + 1,
+                    loop.time(),
+                )
+                if run_file_failures > 1 and self._lacks_alarm:  # the cause of a single failure may pass
                     self._raise_state_lost()
-            if loop.time() >= tried_s + self._interval_s or (self._needs_save and not failed):
+            if loop.time() >= state_tried_s + self._interval_s or (self._needs_save and not failed):
                 history_saved = await self._save_history()
                 failed = not (await self._save() and history_saved)
-                tried_s = loop.time()
-            if loop.time() >= load_tried_s + LOAD_SAVE_S:
+                state_tried_s = loop.time()
+            if loop.time() >= load_tried_s + LOAD_SAVE_INTERVAL_S:
                 await self._save_load()
                 load_tried_s = loop.time()
 
@@ -126,13 +129,13 @@ class CheckpointWriter:
         changed.clear()
 
     async def save_final(self, *, clean: bool) -> None:
-        """Save at the end of a run; give up after ``FINAL_SAVE_S``.
+        """Save at the end of a run; give up after ``FINAL_SAVE_TIMEOUT_S``.
 
         Args:
             clean: True if the run ended as requested, False after an exception.
         """
         try:
-            async with asyncio.timeout(FINAL_SAVE_S):
+            async with asyncio.timeout(FINAL_SAVE_TIMEOUT_S):
                 await self._save(whole=True)
                 await self._save_counters(clean=clean)
                 await self._save_history(is_last=True)
@@ -170,7 +173,7 @@ class CheckpointWriter:
             return 0.0
         if self._alarms.saved_state == self._saved_counters.alarms:
             return self._interval_s
-        return 0.0 if self._lacks_alarm else min(ALARM_SAVE_S, self._interval_s)
+        return 0.0 if self._lacks_alarm else min(ALARM_SAVE_INTERVAL_S, self._interval_s)
 
     @property
     def _lacks_alarm(self) -> bool:
@@ -275,16 +278,16 @@ class CheckpointWriter:
         return await future
 
 
-def lacks_alarm(saved: str, present: str) -> bool:
+def lacks_alarm(saved: str, latest: str) -> bool:
     """Return True if a restart from ``saved`` would lack an alarm, a delay, a measured quantity, a probe or an acknowledgement.
 
     It is also True if an acknowledged alarm has ended: after a restart its acknowledgement would cover a new cause.
 
     Args:
         saved: Saved state of the alarms, as from ``AlarmEvaluator.saved_state``.
-        present: Present state of the alarms.
+        latest: Present state of the alarms.
     """
-    before, after = json.loads(saved or "{}"), json.loads(present or "{}")
+    before, after = json.loads(saved or "{}"), json.loads(latest or "{}")
     if any(before.pop(key, None) != after.pop(key, None) for key in (INPUTS, SILENCE)):
         return True
     if set(after.pop(PENDING, [])) - set(before.pop(PENDING, [])):

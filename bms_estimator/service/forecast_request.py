@@ -82,12 +82,7 @@ def _is_pair(point: Any) -> bool:
 
 
 async def forecast_in_thread(forecaster: Forecaster, trip: Trip | None) -> dict[str, Any]:
-    """Return a forecast from the present state, made in a thread, so that the event loop reads samples meanwhile.
-
-    Args:
-        forecaster: As for ``forecast_data``.
-        trip: As for ``forecast_data``.
-    """
+    """Compute a forecast from the present state in a thread, so that the event loop reads samples meanwhile."""
     return await asyncio.to_thread(forecast_data, forecaster.copy(), trip)
 
 

@@ -24,7 +24,7 @@ class Hook(ABC):
         failures: Number of failed attempts since start.
         relay_resets: Number of resets of the board that undid a relay command, since start.
         error: Reason why the last attempt failed; empty after a success.
-        has_watched: True once due alarms would have been raised.
+        has_watched: True after enough samples had arrived to raise all due alarms.
     """
 
     def __init__(self, settings: AlarmHook) -> None:
@@ -45,7 +45,7 @@ class Hook(ABC):
         """True while a job is running or waiting."""
         return False
 
-    def covers(self, name: str) -> bool:
+    def applies_to(self, name: str) -> bool:
         """Return True if the hook is for this alarm: ``alarm_state_lost`` always, ``hook_failed`` only if listed."""
         if name == "alarm_state_lost":
             return True
@@ -68,10 +68,10 @@ class Hook(ABC):
 
     def restore_active(self, alarms: Iterable[Alarm]) -> None:
         """Restore raised alarms of an earlier run, on which the hook has acted."""
-        self._raised.update({alarm.name: alarm for alarm in alarms if self.covers(alarm.name)})
+        self._raised.update({alarm.name: alarm for alarm in alarms if self.applies_to(alarm.name)})
 
     def close(self) -> None:
-        """Make the hook end after its waiting jobs."""
+        """Request that ``run`` returns after the waiting jobs."""
         self._closing = True
         self._wake.set()
 

@@ -10,7 +10,7 @@ from bms_estimator.settings.alarms import ALARMS, AlarmHook, AlarmSettings
 from bms_estimator.settings.pack import Settings
 
 LONG_RUN_S = 60.0
-"""Time limit of a program above which a warning says that a new critical alarm waits for the running program [s]."""
+"""Timeout of a program above which a warning is given [s], because a new critical alarm waits for a running program."""
 
 
 def has_relay(settings: Settings) -> bool:

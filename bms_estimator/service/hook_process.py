@@ -18,9 +18,9 @@ INHERITED_VARIABLES = ("PATH", "HOME", "USER", "LOGNAME", "SHELL", "LANG", "TZ",
 """Environment variables of the service that every program inherits, besides ``LC_*``. Others may hold secrets."""
 MARK_VARIABLE = "BMS_HOOK_RUN"
 """Environment variable with a random value that marks all processes of one run."""
-POLL_S = 0.05
+POLL_INTERVAL_S = 0.05
 """Interval between two searches for descendants [s]."""
-KILL_S = 5.0
+KILL_TIMEOUT_S = 5.0
 """Time limit for killing [s]. A process that hangs in a system call may end later."""
 
 
@@ -76,7 +76,7 @@ async def run_program(
             await process.communicate(text)
             # polled, because the end of a grandchild causes no event
             while await _find_processes(process.pid, marked_variable) != []:  # noqa: ASYNC110
-                await asyncio.sleep(POLL_S)
+                await asyncio.sleep(POLL_INTERVAL_S)
     except TimeoutError:
         return None
     finally:
@@ -87,7 +87,7 @@ async def run_program(
 async def _kill(process: asyncio.subprocess.Process, marked_variable: bytes) -> None:
     """Kill the program and its descendants."""
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(KILL_S):
+        async with asyncio.timeout(KILL_TIMEOUT_S):
             while (pids := await _find_processes(process.pid, marked_variable)) != []:
                 # without a list, kill the process group, which exists while the program runs
                 if pids is None and process.returncode is None:
@@ -96,7 +96,7 @@ async def _kill(process: asyncio.subprocess.Process, marked_variable: bytes) -> 
                 for pid in pids or ():
                     with contextlib.suppress(ProcessLookupError, PermissionError):
                         os.kill(pid, signal.SIGKILL)
-                await asyncio.sleep(POLL_S)
+                await asyncio.sleep(POLL_INTERVAL_S)
             await process.wait()
 
 

@@ -43,8 +43,8 @@ class Job(NamedTuple):
 class HookJobs:
     """Waiting jobs: at most one for each alarm, and one for all alarms together.
 
-    A change that undoes a waiting job removes it, because the program or the device already has the present state. A raised
-    alarm of a hook that acts on no end is reported although it has ended, so that it is not missed.
+    A change that undoes a waiting job removes it, because the program or the device already has the present state. A hook
+    without ``cleared`` and ``last_cleared`` reports a raised alarm even if the alarm has ended, so that it is not missed.
 
     Args:
         on: Events that cause a job.
@@ -53,7 +53,7 @@ class HookJobs:
 
     def __init__(self, on: Sequence[HookEvent], raised: Mapping[str, Alarm]) -> None:
         self._on, self._raised = on, raised
-        self._reports_ends = "cleared" in on or "last_cleared" in on
+        self._reports_cleared = "cleared" in on or "last_cleared" in on
         self._waiting: dict[str, Job] = {}
 
     def add(self, alarm: Alarm) -> None:
@@ -68,14 +68,14 @@ class HookJobs:
         if waiting is None:
             if event in self._on:
                 self._waiting[job.key] = job
-        elif self._reports_ends or waiting.state == "cleared":
+        elif self._reports_cleared or waiting.state == "cleared":
             del self._waiting[job.key]
 
     def next(self) -> Job | None:
         """Return the next job: critical alarms first, then the oldest; None if no job is waiting."""
         return min(map(self._with_newest_alarm, self._waiting.values()), key=_is_not_critical, default=None)
 
-    def take(self) -> Job | None:
+    def pop(self) -> Job | None:
         """Remove and return the next job; None if no job is waiting."""
         if (job := self.next()) is not None:
             del self._waiting[job.key]
@@ -85,7 +85,7 @@ class HookJobs:
         """Put back a job that was not done. If its alarm has changed since, neither it nor its opposite is due."""
         is_raised = job.key in self._raised if job.key else bool(self._raised)
         if is_raised != (job.state == "raised"):
-            if self._reports_ends:
+            if self._reports_cleared:
                 self._waiting.pop(job.key, None)
         else:
             self._waiting = {job.key: job} | self._waiting
@@ -119,7 +119,7 @@ class JobHook(Hook):
         super().__init__(settings)
         self._device = device
         self._jobs = HookJobs(settings.on, self._raised)
-        self._is_running = False  # a job is running, or the service has ended it
+        self._is_running = False  # also remains True if the shutdown cancels the running job
 
     @property
     def is_busy(self) -> bool:
@@ -134,7 +134,7 @@ class JobHook(Hook):
         while True:
             self._wake.clear()
             backoff = Backoff(FIRST_RETRY_S)
-            while (job := self._jobs.take()) is not None:
+            while (job := self._jobs.pop()) is not None:
                 if self.settings.dry_run:
                     log.warning("alarm hook, dry run", would=self.description, alarm=job.alarm.name, state=job.state)
                     continue

@@ -25,15 +25,15 @@ from bms_estimator.process.memory import anonymous_bytes, available_bytes
 from bms_estimator.process.systemd import extend_start
 
 ORDER_FILE = Path(__file__).with_name("compile_order.txt")
-"""File with the kernels of a first start, callees before callers: CPU time [s], name and types of the arguments.
+"""File with the kernels of a first start, callees before callers. A line has CPU time [s], name and argument types.
 ``make compile-order`` writes it."""
 MAX_CHILD_BYTES = 144 * 2**20
 """Anonymous memory above which a child ends [bytes]. One kernel adds at most 25 MiB."""
 CHILD_BYTES = 256 * 2**20
-"""Available memory for which one child is started [bytes]."""
+"""Available memory that is required for each child [bytes]."""
 MAX_FAILURES = 3
-"""Number of successive children without a compiled kernel after which compilation is given up, for example for lack of memory."""
-REPORT_S = 0.5
+"""Number of successive children that compile no kernel, for example for lack of memory, after which the compilation fails."""
+REPORT_INTERVAL_S = 0.5
 """Interval between two reports of the progress [s]."""
 COMPLETE_FILE = f"complete-py{sys.version_info[0]}{sys.version_info[1]}-{os.uname().machine}"
 """Marker file: a folder that has it contains all kernels for this version of Python and this architecture."""
@@ -91,7 +91,7 @@ def compile_kernels(report: Callable[[Progress], None] = lambda _: None) -> None
         while running := [compiler for compiler in compilers if compiler.is_alive()]:
             report(Progress(len(done), len(order), sum(each.cpu_s for each in done), sum(each.cpu_s for each in order)))
             extend_start(f"compiling kernels: {len(done)} of {len(order)}")
-            running[0].join(REPORT_S)
+            running[0].join(REPORT_INTERVAL_S)
     finally:
         for compiler in compilers:
             compiler.stop()
@@ -117,10 +117,10 @@ class _Compiler(threading.Thread):
         failures = 0
         kernel = self._next()
         while kernel and failures < MAX_FAILURES and (child := self._start_child()):
-            count = len(self._done)
+            done_before = len(self._done)
             with contextlib.suppress(BrokenPipeError), child:  # the child ended, and closing its input fails
                 kernel = self._compile_in(child, kernel)
-            failures = failures + 1 if len(self._done) == count else 0
+            failures = failures + 1 if len(self._done) == done_before else 0
         if kernel:
             self._pending.append(kernel)
 
@@ -175,25 +175,25 @@ def argument_types() -> dict[str, Any]:
     return vars(types) | {name: from_dtype(record) for name, record in records.items()}
 
 
-def compile_call(call: str, names: dict[str, Any]) -> None:
+def compile_call(call: str, types_by_name: dict[str, Any]) -> None:
     """Compile a kernel for the types of its arguments, or load it from the cache.
 
     Args:
         call: Name and types, as in ``Kernel``.
-        names: Types by the names that ``call`` uses.
+        types_by_name: Types by the names that ``call`` uses.
     """
     name, arguments = call.split(" ", 1)
     module, function = name.rsplit(".", 1)
     kernel = getattr(importlib.import_module(f"bms_estimator.{module}"), function)
-    kernel.compile(eval(arguments, names))  # noqa: S307 - a file of this package
+    kernel.compile(eval(arguments, types_by_name))  # noqa: S307 - a file of this package
 
 
 def _compile_calls(calls: Iterator[str], max_bytes: int) -> None:
     """Compile kernels, and write a line to stdout after each. End when this process has more than ``max_bytes`` of memory."""
-    names = argument_types()
+    types_by_name = argument_types()
     for call in calls:
         with contextlib.suppress(Exception):  # a kernel of an outdated order; the program compiles what is missing
-            compile_call(call, names)
+            compile_call(call, types_by_name)
         sys.stdout.write("\n")
         sys.stdout.flush()
         if anonymous_bytes() > max_bytes:

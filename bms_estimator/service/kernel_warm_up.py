@@ -35,7 +35,7 @@ WARM_UP_S = 330
 SILENT_S = 1e6
 """Silence that raises the alarm ``link_lost`` [s]."""
 COLLECT_AFTER = 50_000
-"""Number of new objects after which garbage is collected while kernels compile. numba creates many objects that stay."""
+"""Number of new objects after which garbage is collected while kernels compile. numba creates many objects that are never freed."""
 
 
 def load_kernels() -> None:
@@ -52,7 +52,6 @@ def load_kernels() -> None:
 
 
 def _call_kernels() -> None:
-    """Call all kernels of a live run once."""
     cell = load_cell(CELL)
     estimator = compiled_estimator(Settings(), cell)
     sample = np.zeros(1, dtype=SAMPLE)
@@ -77,7 +76,7 @@ def _call_kernels() -> None:
     estimator.return_to_cell_file()
     remaining_capacity_ah(estimator)
     load_forecast_kernels()
-    _ = FrameDecoder().clock_ppm
+    _ = FrameDecoder().clock_ppm  # a kernel computes the property
 
 
 def _load_fit_kernels(estimator: Estimator) -> None:

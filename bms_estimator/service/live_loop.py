@@ -39,7 +39,7 @@ from bms_estimator.sources.source import Source
 from bms_estimator.telemetry.health import FitTimes
 from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
 
-LOG_S = 3600.0
+LOG_INTERVAL_S = 3600.0
 """Minimum interval between two log lines for each kind of exception [s]; all failures are counted."""
 
 
@@ -55,7 +55,7 @@ class FitThread:
     """
 
     def __init__(self, clock: Clock, executor: Executor | None = None) -> None:
-        self._clock, self._executor = clock, executor or DaemonThreadExecutor("fit")  # for its daemon thread
+        self._clock, self._executor = clock, executor or DaemonThreadExecutor("fit")
         self._logged_s: dict[str, float] = {}
         self.times = FitTimes(None, None)
 
@@ -64,9 +64,9 @@ class FitThread:
         return self._executor.submit(self._measure, call)
 
     def log_failure(self, error: BaseException) -> None:
-        """Log the exception of a fit, once in ``LOG_S`` for each kind."""
+        """Log the exception of a fit, once in ``LOG_INTERVAL_S`` for each kind."""
         kind, now_s = type(error).__name__, self._clock.monotonic()
-        if now_s - self._logged_s.get(kind, -math.inf) >= LOG_S:
+        if now_s - self._logged_s.get(kind, -math.inf) >= LOG_INTERVAL_S:
             self._logged_s[kind] = now_s
             log.warning("the fit of the pack's model failed; the previous fit stays", kind=kind, exc_info=error)
 
@@ -80,9 +80,9 @@ class FitThread:
 
 LAG_STEP_S = 0.1
 """Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""
-SEND_TURNS = 2
-"""Number of turns of the event loop in which a published estimate is sent: one takes it from the outbox, one writes it."""
-STATUS_S = 60.0
+SEND_ITERATIONS = 2
+"""Iterations of the event loop that send a published estimate: one takes it from the outbox, one writes it."""
+STATUS_INTERVAL_S = 60.0
 """Interval between two SOC texts for systemd [s]. The start and end of samples are reported at once."""
 
 log = structlog.get_logger(__name__)
@@ -99,15 +99,15 @@ class ServiceParts:
     current_zero: Callable[[], Awaitable[None]] | None = None
     """Makes the board store the present current as zero; None: the source has no such command."""
     board_check: BoardCheck | None = None
-    """Reports another calibration of the board; None: the source has no such check."""
+    """Reports that the calibration of the board has changed; None: the source has no such check."""
     notifier: SystemdNotifier | None = None
-    """Is notified that the loop is ready and alive."""
+    """Notifies systemd that the loop is ready and alive."""
     hooks: AlarmHooks | None = None
     """Alarm hooks; opened and closed by the loop."""
     edge: BlockSender | None = None
     """Sender that also receives all samples. Its owner opens and closes it."""
     fit_executor: Executor | None = None
-    """Runs the fits of the pack's model; None: a thread of their own."""
+    """Runs the fits of the pack's model; None: a separate thread."""
 
 
 async def run_estimation_loop(
@@ -160,17 +160,17 @@ async def run_estimation_loop(
         on_alarm=hooks.on_alarm_change,
     )
     monitor = publisher.alarm_monitor
-    unrestored = monitor.restore(counters.alarms, crashed=saved_run.crashed)
+    restore_error = monitor.restore(counters.alarms, crashed=saved_run.crashed)
     hooks.is_watching = monitor.check_silence
     hooks.restore_active(monitor.report, counters.hooks, crashed=saved_run.crashed)
-    if lost_reason := saved_run.lost_reason or unrestored:
-        # after the restored alarms, because the hooks announce this one
+    if lost_reason := saved_run.lost_reason or restore_error:
+        # after restore_active, so that the hooks announce this alarm
         monitor.raise_state_lost(lost_reason)
     if parts.board_check:
         parts.board_check.on_recalibrated = monitor.raise_state_lost
-    # with a raised alarm or a lost cell the slots of the earlier run, so that a floating slot does not replace this cell
-    is_known = monitor.alarms.active or monitor.alarms.unwatched_critical
-    slots = CellSlots(model.cell.series_count, counters.cell_slots if is_known else (), counters.cell_slots)
+    # a raised alarm or a lost cell keeps the slots of the earlier run, so that a floating input does not replace the cell
+    keeps_slots = monitor.alarms.active or monitor.alarms.unwatched_critical
+    slots = CellSlots(model.cell.series_count, counters.cell_slots if keeps_slots else (), counters.cell_slots)
     if parts.requests is not None:
         RequestHandlers(pack, publisher, parts.current_zero).register(parts.requests)
     writer = (
@@ -206,7 +206,7 @@ async def run_estimation_loop(
             await until_first_ends(*tasks, stop.wait())
             monitor.evaluate(clock.monotonic())  # samples since the last evaluation, for the final save
             clean = True
-        finally:  # an exception ends the loop, too
+        finally:  # also after an exception
             notifier.stopping(name)
             hooks.stop_watching()
             monitor.stop()
@@ -232,7 +232,7 @@ async def _estimate(
         source: Supplies the blocks.
         pack: The pack.
         slots: Cell slots of the source.
-        totals: Totals over restarts.
+        totals: Lifetime totals.
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.
         restored_s: Time since boot at which the state was restored [s].
@@ -256,7 +256,7 @@ async def _estimate(
         totals.add(step.trace)
         try:
             # the sinks send now, so that the alarms do not delay them and a source that always has a block does not starve them
-            for _ in range(SEND_TURNS if publisher.add_estimates(received, step) else 1):
+            for _ in range(SEND_ITERATIONS if publisher.add_estimates(received, step) else 1):
                 await asyncio.sleep(0)
         finally:  # the final save needs the alarms of all samples
             publisher.add_to_alarms(received, step, slots.fault)
@@ -273,7 +273,7 @@ async def _keep_alive(
             notifier.alive(name)
         status.log_lines_lost = stderr.lost
         now_s, text, online = clock.monotonic(), publisher.status, publisher.snapshot.health.sensor_online
-        if text != sent_text and (now_s - sent_s >= STATUS_S or online != sent_online):
+        if text != sent_text and (now_s - sent_s >= STATUS_INTERVAL_S or online != sent_online):
             notifier.status(name, text)
             sent_text, sent_online, sent_s = text, online, now_s
         await asyncio.sleep(min(max(publisher.wait_s, 0.01), max_wait_s))

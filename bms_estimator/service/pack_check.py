@@ -7,7 +7,7 @@ from bms_estimator.estimator.stability_conditions import observer_warnings
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.mqtt.broker_config import check as check_brokers
 from bms_estimator.page.access_control import make_access_control
-from bms_estimator.process.systemd import is_for_the_service
+from bms_estimator.process.systemd import is_unreadable_credential
 from bms_estimator.service.hook_check import hook_warnings
 from bms_estimator.settings.alarm_limits import implausible_limits
 from bms_estimator.settings.exports import EdgeSettings, InfluxSettings
@@ -99,5 +99,5 @@ def _unreadable(
 ) -> tuple[set[str], list[str]]:
     """Return the keys of files that only the running service can read, and a warning for each."""
     files = {key: getattr(settings, key) for key in keys}
-    unreadable = {key: name for key, name in files.items() if name is not None and is_for_the_service(name)}
+    unreadable = {key: name for key, name in files.items() if name is not None and is_unreadable_credential(name)}
     return set(unreadable), [f"{section}.{key} = {name}: {ONLY_IN_SERVICE}" for key, name in unreadable.items()]

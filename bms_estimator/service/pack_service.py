@@ -68,9 +68,9 @@ async def run_pack_service(
         cell: Model of the whole pack.
         sinks: Further sinks, such as the terminal.
         tap: Receives all bytes of the source with their arrival times.
-        stop: Event that ends the service; signals set it, too.
+        stop: Event that ends the service. Signals also set it.
         folder: State folder (``state_folder``); None: the state is not saved.
-        notifier: Is notified that the loop is ready and alive.
+        notifier: Notifies systemd that the loop is ready and alive.
         pages: Page servers of this process; None: new ones.
 
     Returns:
@@ -91,8 +91,8 @@ async def run_pack_service(
     if database and settings.store.history_days:
         all_sinks.append(HistorySink(database, days=settings.store.history_days))
     requests = RequestDispatcher(delivery, settings.mqtt.commands if settings.mqtt else ())
-    memory = KnownBoardFile(folder, settings.pack.name) if folder else None
-    device = open_device(settings, tap=tap, board_file=memory)
+    board_file = KnownBoardFile(folder, settings.pack.name) if folder else None
+    device = open_device(settings, tap=tap, board_file=board_file)
     board = device if isinstance(device, SerialSource) else None
     source = with_bms(device, settings)
     outbox = Outbox(database, max_messages=settings.store.outbox_messages)
@@ -199,14 +199,14 @@ async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None
     _require_unique("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
     _require_unique("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
     for settings, cell in packs:  # before any service starts
-        with _error_of_pack(settings):
+        with _prefixed_errors(settings):
             monitored_alarms(settings, cell)
     stop, notifier, pages = stop_on_signal(), SystemdNotifier(names), Pages()
 
     async def run_one(settings: Settings, cell: PackModel) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
-            with _error_of_pack(settings):
+            with _prefixed_errors(settings):
                 folder = state_folder(settings)
                 await run_pack_service(settings, cell, stop=stop, folder=folder, notifier=notifier, pages=pages)
         finally:
@@ -219,8 +219,8 @@ async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None
 
 
 @contextlib.contextmanager
-def _error_of_pack(settings: Settings) -> Iterator[None]:
-    """Begin the text of a UserError with the pack's name."""
+def _prefixed_errors(settings: Settings) -> Iterator[None]:
+    """Prefix the text of a UserError with the pack's name."""
     try:
         yield
     except UserError as error:

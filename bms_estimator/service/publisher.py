@@ -12,7 +12,7 @@ from bms_estimator.model.payloads.health import FRESH_PERIODS, Health, LoopHealt
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info, Snapshot
 from bms_estimator.pack.pack import Pack, RunResult
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.service_status import Latency, ServiceStatus
+from bms_estimator.service.service_status import LatencyHistogram, ServiceStatus
 from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
@@ -40,11 +40,11 @@ from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capa
 
 log = structlog.get_logger(__name__)
 
-SLOW_S = 1.0
+SLOW_INTERVAL_S = 1.0
 """Minimum interval between two payloads of parameters, health or info, at any publish rate [s]."""
-FORECAST_S = 60.0
+FORECAST_INTERVAL_S = 60.0
 """Minimum interval between two payloads of the forecast's curves [s]."""
-CELLS_S = 60.0
+CELLS_INTERVAL_S = 60.0
 """Minimum interval between two comparisons of the cells [s]."""
 SOURCE_HUNG_S = 20.0
 """Time after which a source whose task has not run counts as hung [s]. A missing port is retried at least every 10 s."""
@@ -60,7 +60,7 @@ class Publisher:
         sinks: Destinations of the snapshots.
         clock: The clocks.
         status: State of the service around the pack.
-        totals: Totals over restarts; default: new totals.
+        totals: Lifetime totals; default: new totals.
         on_alarm: Called with each alarm that is raised or cleared.
 
     Attributes:
@@ -88,23 +88,25 @@ class Publisher:
         self._totals = totals or LifetimeTotals(estimator, new_totals(clock.wall()))
         self._rest = RestDetector(cell.cell.current_max_a, settings.sensor.voltage_resolution_v)
         self._board: Mapping[str, str] = {}
-        self._latency = Latency()
-        self._forecast_s = -math.inf  # time of the last payload of the curves
+        self._latency = LatencyHistogram()
+        self._forecast_sent_s = -math.inf  # time of the last payload of the curves
         self._no_forecast = no_forecast(cell.no_forecast_reason)
         self._device_soc: float | None = None  # SOC that the device reported last
         self._flow = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
-        self._cells_s = -math.inf  # time of the last comparison of the cells, monotonic clock
+        self._cells_sent_s = -math.inf  # time of the last comparison of the cells, monotonic clock
         self.alarm_monitor = AlarmMonitor(settings, pack, source, clock, on_alarm, self._status.hooks)
         self._short_limit_a = short_limit_a(settings, cell)
         self._logged_faults = 0  # bits of ``InputFault``
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
-        self._sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
+        self._last_sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
-        self._dropped_before = self._dropped()  # number of dropped samples by kind before the present series of them
+        self._dropped_before = (
+            self._dropped_counts()
+        )  # number of dropped samples by kind when the last sample was accepted
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -117,7 +119,7 @@ class Publisher:
 
     @property
     def wait_s(self) -> float:
-        """Return the time until a snapshot is overdue, which shows that no samples arrive [s]."""
+        """Time until a snapshot is overdue, which shows that no samples arrive [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
     def add(self, received: ReceivedSamples, step: RunResult, cells_fault: str = "") -> None:
@@ -132,29 +134,29 @@ class Publisher:
         self.add_to_alarms(received, step, cells_fault)
 
     def add_estimates(self, received: ReceivedSamples, step: RunResult) -> bool:
-        """Do the first part of ``add``. Return True if it has published a snapshot.
+        """Add the estimates without evaluating the alarms. Return True if a snapshot was published.
 
-        The alarms follow in ``add_to_alarms``, so that their evaluation does not delay the estimate. The first snapshot follows
-        there, too, because it lists the alarms that the first samples permit.
+        ``add_to_alarms`` evaluates the alarms later, so that they do not delay the estimate. It also publishes the first snapshot,
+        because this snapshot lists the alarms that the first samples permit.
         """
         if self._status.source_health:
             self._latency.add(self._status.source_health().block_age_s)
         now_s, trace = self._clock.monotonic(), step.trace
         if trace.size:
             self._window.add(trace, self._clock.wall(), received.cells_v, received.probes)
-            self._sample_s = now_s
+            self._last_sample_s = now_s
         self._device_soc = finite(received.device_soc[-1]) if received.device_soc.size else None
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
         elif self._drop_reason is not None:
-            self._drop_reason, self._dropped_before = None, self._dropped()
+            self._drop_reason, self._dropped_before = None, self._dropped_counts()
         if now_s < self._due_s or not self.latest:
             return False
         self._publish_snapshot(now_s)
         return True
 
     def add_to_alarms(self, received: ReceivedSamples, step: RunResult, cells_fault: str = "") -> None:
-        """Do the second part of ``add``, after ``add_estimates``."""
+        """Evaluate the alarms of the samples that were passed to ``add_estimates``."""
         now_s = self._clock.monotonic()
         alarm_changed = self.alarm_monitor.add(received, step, now_s, cells_fault)
         if not self.latest and now_s >= self._due_s:
@@ -192,13 +194,13 @@ class Publisher:
 
     def publish_last(self) -> None:
         """Publish a last snapshot with all payloads recomputed."""
-        self._slow_s = self._forecast_s = self._cells_s = -math.inf
+        self._slow_sent_s = self._forecast_sent_s = self._cells_sent_s = -math.inf
         self.publish()
 
     @property
     def alive(self) -> bool:
         """True while samples arrive or the task of the source runs."""
-        fresh = self._clock.monotonic() - self._sample_s <= self._fresh_s
+        fresh = self._clock.monotonic() - self._last_sample_s <= self._fresh_s
         health = self._status.source_health
         return fresh or health is None or health().task_idle_s <= SOURCE_HUNG_S
 
@@ -216,13 +218,13 @@ class Publisher:
         return self.snapshot.health.sensor_message or self._rest.not_at_rest_reason(self._clock.monotonic())
 
     def _first_snapshot(self) -> Snapshot:
-        now_s = self._slow_s = self._started_s
+        now_s = self._slow_sent_s = self._started_s
         parameters = make_parameters_payload(self._estimator, self._started_wall_s)
         return Snapshot(
             None,
             parameters,
-            self._health(now_s, self._sensor_message(now_s)),
-            self._info(),
+            self._make_health(now_s, self._sensor_message(now_s)),
+            self._make_info(),
             self.alarm_monitor.report,
         )
 
@@ -230,28 +232,28 @@ class Publisher:
         """Return a snapshot with the estimate of this window. Other payloads are recomputed only when they are due."""
         _, parameters, health, info, _, forecast, cells = self.snapshot
         summary, wall_s = self._window.take(), self._clock.wall()
-        estimate = self._estimate(summary, wall_s) if summary else None
-        if summary and now_s - self._forecast_s >= FORECAST_S:
-            self._forecast_s, forecast = now_s, self._forecast(summary, wall_s)
+        estimate = self._make_estimate(summary, wall_s) if summary else None
+        if summary and now_s - self._forecast_sent_s >= FORECAST_INTERVAL_S:
+            self._forecast_sent_s, forecast = now_s, self._make_forecast(summary, wall_s)
         message = self._sensor_message(now_s)
-        slow_due = now_s - self._slow_s >= SLOW_S
+        slow_due = now_s - self._slow_sent_s >= SLOW_INTERVAL_S
         if slow_due:
-            self._slow_s = now_s
-            parameters, info = make_parameters_payload(self._estimator, wall_s), self._info()
+            self._slow_sent_s = now_s
+            parameters, info = make_parameters_payload(self._estimator, wall_s), self._make_info()
         if slow_due or health.sensor_online != (message is None):
-            health = self._health(now_s, message)
+            health = self._make_health(now_s, message)
             self._log_input_faults(health)
-        if now_s - self._cells_s >= CELLS_S and self._deviations is not None:
-            self._cells_s, cells = now_s, make_cells_payload(self._deviations, self._short_limit_a, wall_s)
+        if now_s - self._cells_sent_s >= CELLS_INTERVAL_S and self._deviations is not None:
+            self._cells_sent_s, cells = now_s, make_cells_payload(self._deviations, self._short_limit_a, wall_s)
         return Snapshot(estimate, parameters, health, info, self.alarm_monitor.report, forecast, cells)
 
     @property
     def _deviations(self) -> CellDeviations | None:
         return self._pack.cells.deviations if self._pack.cells else None
 
-    def _estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
-        # only saved values, so that the next run continues from there
-        self._flow = self._flow.at_least(self._status.saved_flow or self._totals.charge_energy)
+    def _make_estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
+        # only saved values are published, so that the next run continues from the published ones
+        self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
         capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:
@@ -268,11 +270,11 @@ class Publisher:
             self._device_soc,
         )
 
-    def _forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:
+    def _make_forecast(self, window: WindowSummary, wall_s: float) -> ForecastReport | None:
         forecaster = self._pack.forecaster
         return make_forecast_payload(forecaster.latest, forecaster.cutoff_v, window, wall_s) if forecaster else None
 
-    def _health(self, now_s: float, message: str | None) -> Health:
+    def _make_health(self, now_s: float, message: str | None) -> Health:
         lag_s, self._lag_s, status, slow_fit = self._lag_s, 0.0, self._status, self._pack.slow_fit
         return make_health_payload(
             self._estimator.record[0],
@@ -288,7 +290,7 @@ class Publisher:
             clock_ppm=self._source.clock_ppm,
             total=self._totals.total,
             unseen_s=self._totals.unseen_s,
-            loop=self._loop(),
+            loop=self._loop_health(),
             recording=status.recording(),
             edge=status.edge(),
             hooks=status.hooks(),
@@ -302,8 +304,8 @@ class Publisher:
             self._logged_faults = suspects
             log.warning("suspected input faults", suspects=health.suspects or "none")
 
-    def _loop(self) -> LoopHealth:
-        p50_s, p99_s, max_s = self._latency.take() or (None, None, None)
+    def _loop_health(self) -> LoopHealth:
+        p50_s, p99_s, max_s = self._latency.pop_summary() or (None, None, None)
         status = self._status
         return LoopHealth(
             latency_p50_s=p50_s,
@@ -315,7 +317,7 @@ class Publisher:
             disk_free_mib=status.disk_free_mib,
         )
 
-    def _info(self) -> Info:
+    def _make_info(self) -> Info:
         self._board = self._source.board or self._board  # properties of an unplugged board remain
         sensed = bool(self._estimator.record["filter"]["sensed"][0])
         return make_info_payload(
@@ -324,19 +326,19 @@ class Publisher:
 
     def _sensor_message(self, now_s: float) -> str | None:
         """Return the reason why no fresh values arrive; None when they do."""
-        silent_s = now_s - self._sample_s
+        silent_s = now_s - self._last_sample_s
         if silent_s <= self._fresh_s:
             return None
         if self._source.silence_reason:
             return self._source.silence_reason
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
-        dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped().items()}
+        dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped_counts().items()}
         text = f"no usable sample for {silent_s:.1f} s"
         text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
         return f"{text}; {self._drop_reason}" if self._drop_reason else text
 
-    def _dropped(self) -> dict[str, int]:
+    def _dropped_counts(self) -> dict[str, int]:
         """Return the dropped samples by kind."""
         counted = sample_counters(self._estimator.state[0]).items()
         return {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}

@@ -20,20 +20,20 @@ RELAY_RETRY_S = 0.5
 RESET_POLL_S = 0.1
 """Interval between two checks for a reset of the board [s]."""
 FIRST_HOLD_S = 30.0
-"""First waiting time, and time for which a command must hold after a reset until the hook has no error [s]."""
+"""First hold time, and time without a reset after which the hook has no error [s]."""
 MAX_HOLD_S = 600.0
-"""Longest waiting time [s]. It limits a relay whose load resets the board to six switchings an hour."""
+"""Maximum hold time [s]. It limits a relay whose load resets the board to six switchings an hour."""
 QUIET_S = 3600.0
-"""Time without a reset after which the waiting times start again with the first one [s]."""
+"""Time without a reset after which the next reset counts as the first one [s]."""
 
 log = structlog.get_logger(__name__)
 
 
 class RelayHold:
-    """Waiting times of one relay. Each further reset doubles the waiting time.
+    """Hold of a relay: time after a reset of the board in which the pin is not set high. Each further reset doubles it.
 
-    If low is the safe level, the first reset already causes a waiting time. Otherwise the pin's low level after a reset is
-    the unsafe one, and the first reset causes no waiting time.
+    If low is the safe level, the first reset starts a hold. Otherwise the pin's low level after a reset is the unsafe one, and
+    the first reset starts no hold.
 
     Args:
         low_is_safe: True if the pin is low while an alarm is raised.
@@ -41,7 +41,7 @@ class RelayHold:
     Attributes:
         boots: Number of boots of the board at the last check.
         resets: Number of resets without a quiet time between them.
-        hold_s: Waiting time after the last reset [s].
+        hold_s: Hold time after the last reset [s].
     """
 
     def __init__(self, *, low_is_safe: bool) -> None:
@@ -50,7 +50,7 @@ class RelayHold:
         self._reset_s = self._hold_end_s = self._proven_s = -QUIET_S
 
     def check(self, boots: int, now_s: float) -> int:
-        """Return the number of resets since the last check.
+        """Start a hold if the board was reset since the last check. Return the number of these resets.
 
         Args:
             boots: Number of boots of the board.
@@ -58,16 +58,16 @@ class RelayHold:
         """
         resets, self.boots = boots - self.boots, boots
         if resets:
-            self._start(resets, now_s)
+            self._start_hold(resets, now_s)
             self._proven_s = now_s + max(self.hold_s, FIRST_HOLD_S)
         return resets
 
     def resume(self, now_s: float) -> None:
-        """Wait as after a reset, because the relay may have failed before the restart of the service."""
-        self._start(1, now_s)
+        """Start a hold as after a reset, because the relay may have failed before the restart of the service."""
+        self._start_hold(1, now_s)
 
     def end(self) -> None:
-        """End the waiting time, because an alarm was raised. It starts again with the next reset."""
+        """End the hold, because an alarm was raised. If low is the safe level, the hold remains: it permits the low level."""
         if not self._low_is_safe:
             self._hold_end_s = -QUIET_S
 
@@ -81,7 +81,7 @@ class RelayHold:
         """Return True if the commands after the last reset have held long enough."""
         return now_s >= self._proven_s
 
-    def _start(self, resets: int, now_s: float) -> None:
+    def _start_hold(self, resets: int, now_s: float) -> None:
         if now_s - self._reset_s >= QUIET_S:
             self.resets = 0
         self.resets += resets
@@ -116,8 +116,8 @@ class RelayHook(Hook):
         settings: Settings of the hook.
         board: The board.
         clock: Time since boot of the host [s].
-        is_watching: Returns True once due alarms would be raised. Before that, the level without an alarm is not sent, so that a
-            restart or a crash loop connects no load.
+        is_watching: Returns True once enough samples have arrived to raise all due alarms. Before that, the level without an
+            alarm is not sent, so that a restart or a crash loop connects no load.
     """
 
     def __init__(
@@ -158,10 +158,10 @@ class RelayHook(Hook):
         while not self.settings.dry_run and not self._closing:
             self._wake.clear()
             self._check_resets()
-            refusal = await self._send_level()
-            self._check_resets()  # a command is done only if the board was not reset after it
-            self._set_error(self._reset_error() or refusal)
-            await self._wait(RELAY_RETRY_S if refusal else RELAY_S)
+            command_error = await self._send_level()
+            self._check_resets()  # a reset after the command undoes it
+            self._set_error(self._reset_error() or command_error)
+            await self._wait(RELAY_RETRY_S if command_error else RELAY_S)
 
     def _check_resets(self) -> None:
         resets = self._hold.check(self._board.boots, self._clock())
@@ -171,7 +171,7 @@ class RelayHook(Hook):
             self._set_error(self._reset_error())
 
     async def _send_level(self) -> str:
-        """Send the level that is allowed now. Return why the board does not confirm it; empty if it does."""
+        """Send the level that is allowed now. Return the reason why the board does not confirm it; empty if it does."""
         self.has_watched = self._is_watching() or self.has_watched  # first, because it may raise alarms
         if not (self._raised or self.has_watched):
             return ""

@@ -10,15 +10,15 @@ from bms_estimator.sources.source import SourceHealth
 from bms_estimator.telemetry.health import NO_FIT, FitTimes
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
 
-MIN_S = 1e-5
+MIN_LATENCY_S = 1e-5
 """Upper edge of the first bin [s]."""
 BINS_PER_OCTAVE = 4
 """Number of bins per doubling of the latency, so that each bin is a fifth wider than the previous one."""
 BINS = 100
-"""Number of bins; the last one begins at five minutes."""
+"""Number of bins; the last one begins at four minutes."""
 
 
-class Latency:
+class LatencyHistogram:
     """Histogram of latencies in logarithmic bins, so that adding a value is cheap."""
 
     def __init__(self) -> None:
@@ -27,14 +27,14 @@ class Latency:
 
     def add(self, latency_s: float) -> None:
         """Add a latency [s]."""
-        octaves = math.log2(max(latency_s, MIN_S) / MIN_S)
+        octaves = math.log2(max(latency_s, MIN_LATENCY_S) / MIN_LATENCY_S)
         self._counts[min(math.ceil(BINS_PER_OCTAVE * octaves), BINS - 1)] += 1
         self._max_s = max(self._max_s, latency_s)
 
-    def take(self) -> tuple[float, float, float] | None:
-        """Return median, 99th percentile and maximum since the last call [s]; None without a value.
+    def pop_summary(self) -> tuple[float, float, float] | None:
+        """Return median, 99th percentile and maximum since the last reset [s], and reset them; None without a value.
 
-        The percentiles are too long by up to a fifth.
+        The percentiles are overestimated by up to a fifth, the width of a bin.
         """
         counts, max_s = self._counts, self._max_s
         self._counts, self._max_s = [0] * BINS, 0.0
@@ -49,7 +49,7 @@ def _percentile(counts: list[int], fraction: float, max_s: float) -> float:
     for i, count in enumerate(counts):
         cumulative += count
         if cumulative >= rank:
-            return min(MIN_S * math.exp2(i / BINS_PER_OCTAVE), max_s)
+            return min(MIN_LATENCY_S * math.exp2(i / BINS_PER_OCTAVE), max_s)
     return max_s
 
 

@@ -77,8 +77,8 @@ default: it only rejects invalid samples, and lies far above the continuous curr
 COLLAPSE_CLEAR_FRACTION = 0.5
 """Clear level of ``collapse_risk`` as a fraction of its limit."""
 WEAK_CELL_STD = weak_cell_limit(DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH)
-"""Default limit of ``weak_cell``: deviation of a discharge from the bank's reference [std]. It also decides which discharges
-are no reference."""
+"""Default limit of ``weak_cell``: deviation of a discharge from the bank's reference [std]. A discharge
+that exceeds it does not become part of the reference."""
 WEAK_CELL_CLEAR_FRACTION = 0.5
 """Clear level of ``weak_cell`` as a fraction of its limit."""
 CURRENT_CLEAR_FRACTION = 0.95
@@ -92,7 +92,7 @@ MIN_SHORT_C = 1 / 30_000
 MIN_READING_ERROR_V = 0.01
 """Default limit of the error of a cell's reading [V]: ten steps of the usual converter."""
 BALANCING_BELOW_V = 0.25
-"""Voltage below the default limit of ``cell_over_voltage`` from which balancers are usually active [V]: 3.40 V for LFP,
+"""Distance below the default limit of ``cell_over_voltage`` from which balancers are usually active [V]: 3.40 V for LFP,
 4.00 V for cells that are charged to 4.2 V."""
 
 
@@ -145,7 +145,6 @@ def silent_limit_s(settings: Settings) -> float:
 
 
 def _default_silent_limit_s(settings: Settings) -> float:
-    """Return the default limit of ``link_lost`` [s]."""
     return max(
         MIN_SILENT_LIMIT_S, SILENT_PERIODS * max(1.0 / settings.publish.rate_hz, settings.sensor.sample_period_s)
     )
@@ -191,7 +190,7 @@ def _implausible_limits(alarms: tuple[AlarmDefinition, ...], cell: PackModel) ->
                 if alarm.name in PLAUSIBLE_TEMPERATURES_C
                 else "the range of the cell file; is the value for one cell instead of the pack, or the reverse?"
             )
-            key = f"alarms.{alarm.name}.limit_{unit[-1:].lower()}"
+            key = f"alarms.{alarm.name}.limit_{unit[-1:].lower()}"  # limit_v, limit_a or limit_c
             yield f"{key} = {alarm.limit:g}: outside {low:.4g} to {high:.4g} {unit}, {hint}"
         if alarm.severity == "critical" and alarm.delay_s > LONG_DELAY_S:
             yield (
@@ -223,7 +222,6 @@ def _definition(name: AlarmName, rule: AlarmRule, default: _Default) -> AlarmDef
 
 
 def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
-    """Return the defaults by alarm."""
     n = cell.cell.series_count
     all_packs: dict[AlarmName, _Default] = {
         "over_temperature": _Default(60.0, 55.0),
@@ -258,7 +256,6 @@ def _weak_cell_default(settings: Settings) -> _Default:
 
 
 def _voltage_limits(cell: PackModel) -> VoltageLimits:
-    """Return the default voltage limits of one cell of a pack."""
     nominal_v = cell.cell.nominal_voltage_v / cell.cell.series_count
     return next(limits for max_nominal_v, limits in _VOLTAGE_LIMITS if nominal_v < max_nominal_v)
 
@@ -267,7 +264,7 @@ def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
     c, n = cell.cell, cell.cell.series_count
     v = _voltage_limits(cell)
     short_a = MIN_SHORT_C * c.capacity_ah
-    compares = n >= MIN_CELLS
+    can_compare = n >= MIN_CELLS
     charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
     discharge_a = min(MAX_DISCHARGE_C * c.capacity_ah, c.current_max_a)
     return {
@@ -277,8 +274,8 @@ def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
         "cell_under_voltage": _Default(v.under_v, v.under_clear_v),
         "discharge_over_current": _Default(discharge_a, CURRENT_CLEAR_FRACTION * discharge_a),
         "charge_over_current": _Default(charge_a, CURRENT_CLEAR_FRACTION * charge_a),
-        "cell_short": _Default(short_a, 0.5 * short_a) if compares else _UNMONITORED,
-        "cell_sensor_fault": _Default(MIN_READING_ERROR_V, 0.5 * MIN_READING_ERROR_V) if compares else _UNMONITORED,
+        "cell_short": _Default(short_a, 0.5 * short_a) if can_compare else _UNMONITORED,
+        "cell_sensor_fault": _Default(MIN_READING_ERROR_V, 0.5 * MIN_READING_ERROR_V) if can_compare else _UNMONITORED,
     }
 
 

@@ -113,7 +113,7 @@ class AlarmHook(Strict):
     on: tuple[HookEvent, ...] = Field(
         default=("raised", "cleared"),
         description="changes at which the program is run or the message published: raised and cleared are those of each "
-        "alarm; first_raised and last_cleared those between none and any of the alarms",
+        "alarm; first_raised is the first of the alarms to be raised, last_cleared the end of the last raised one",
     )
     run: tuple[Annotated[str, Field(min_length=1)], ...] | None = Field(
         default=None, description="program to run and its arguments; no shell is used"
@@ -226,7 +226,7 @@ class AlarmSettings(Strict):
     )
 
     @model_validator(mode="after")
-    def _only_one_relay_hook(self) -> Self:
+    def _check_relay_hooks(self) -> Self:
         if sum(hook.relay is not None for hook in self.hook) > 1:
             raise ValueError("hook: the board has one relay; give one hook with all its alarms")
         return self
@@ -246,7 +246,7 @@ class AlarmSettings(Strict):
 
 
 def _merge_rule(default: AlarmRule, rule: Any) -> Any:
-    """Return an alarm's defaults with the configured settings. A value that is no table is left to the validation."""
+    """Return an alarm's defaults with the configured settings. A value that is not a table is left to the validation."""
     if not isinstance(rule, dict):
         return rule
     return default.model_dump(exclude_none=True) | rule

@@ -62,7 +62,7 @@ class InfluxSettings(Strict):
     )
 
     @model_validator(mode="after")
-    def _matching_credentials(self) -> Self:
+    def _check_credentials(self) -> Self:
         if self.bucket and (self.username or self.password_file):
             raise ValueError("username and password_file: of no use with bucket; give token_file instead")
         if not self.bucket and (self.token_file or self.org):
@@ -89,7 +89,7 @@ class PrometheusSettings(Strict):
         return int(self.listen.rpartition(":")[2])
 
     @model_validator(mode="after")
-    def _valid_address(self) -> Self:
+    def _check_address(self) -> Self:
         if not 0 < self.port < 65536:
             raise ValueError("port: must be 1 to 65535")
         self.host.encode("idna")  # the resolver encodes the name this way and would fail later

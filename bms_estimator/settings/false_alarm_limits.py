@@ -22,7 +22,7 @@ COLLAPSE_FALSE_ALARMS = (
 (docs/theory/forecast.md)."""
 WEAK_CELL_FALSE_ALARMS = ((0.12, 4.0), (0.23, 3.5), (0.35, 3.0), (0.58, 2.5), (1.16, 2.0), (4.77, 1.5))
 """Pairs of the number of false alarms in 100 h of discharges and the limit [std]: points of the measured curve of healthy
-simulated banks (``make bank``, docs/pack/cells.md). There was none at 4 std in 859 h; the rate is that of one."""
+simulated banks (``make bank``, docs/pack/cells.md). At 4 std, no false alarm occurred in 859 h; the rate is that of one alarm."""
 DEFAULT_WEAK_CELL_FALSE_ALARMS_PER_MONTH = 0.1
 """Default of the accepted number of false alarms in a month of 60 h of use. About one a year."""
 
@@ -48,7 +48,7 @@ def weak_cell_limit(false_alarms_per_month: float) -> float:
 def _limit_of_rate(measured: Sequence[tuple[float, float]], false_alarms_per_month: float) -> float:
     """Return the limit of an alarm for an accepted rate of false alarms.
 
-    The limit is interpolated over the logarithm of the rate. Outside the measured curve it is that of the curve's end.
+    The limit is interpolated over the logarithm of the rate. Outside the measured curve, the limit of the nearest end applies.
 
     Args:
         measured: Pairs of the number of false alarms in 100 h of use and the limit, with increasing numbers.

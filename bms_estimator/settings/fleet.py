@@ -50,7 +50,7 @@ class ServerSettings(Strict):
     )
     block_s: Annotated[float, Field(ge=1, le=3600)] = Field(
         default=60.0,
-        description="shortest block_s of the edges [s], from which the number of blocks follows that the server stores of each pack",
+        description="shortest block_s of the edges [s], which determines the number of blocks of each pack that the server stores",
     )
     disk_gb: Gigabytes | None = Field(
         default=None, description="maximum size of all streams; default: three quarters of the free space at the start"
@@ -128,7 +128,7 @@ class FleetSettings(Strict):
         """Reject a server that other machines can reach without TLS and tenants.
 
         Args:
-            setting: Setting or option that makes the server client_address, for the error.
+            setting: Setting or option that makes the server reachable from other machines, for the error.
 
         Raises:
             ValueError: TLS or tenants are missing, so that any client could read and write all data.

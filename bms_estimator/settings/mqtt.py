@@ -45,6 +45,6 @@ class MqttSettings(BrokerSettings):
     )
     profile: Literal["venus-os"] | None = Field(
         default=None,
-        description="also publish the battery for a Victron GX device on the topic venus below that of the pack, as dbus-mqtt-battery reads it",
+        description="also publish the battery for a Victron GX device, in the format of dbus-mqtt-battery, on the topic venus below the topic of the pack",
     )
     commands: tuple[Command, ...] = Field(default=(), description="commands that clients may send; default: none")

@@ -56,9 +56,9 @@ class ObserverSettings(Strict):
     )
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Return names and values for ``repr``, whose hash marks stored states.
+        """Return names and values for ``repr``, whose hash identifies the settings of a stored state.
 
-        Constants that were settings before are included, so that the hashes of stored states stay valid.
+        Constants that earlier versions had as settings are included, so that the hashes of stored states stay valid.
         """
         yield from super().__repr_args__()
         yield "scheme_2_lambda", SCHEME_2_LAMBDA
@@ -66,7 +66,7 @@ class ObserverSettings(Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _no_rearm(cls, table: object) -> object:
+    def _convert_never_to_none(cls, table: object) -> object:
         """Convert ``rearm_gain = "never"`` to None, because TOML has no null."""
         if isinstance(table, dict) and table.get("rearm_gain") == "never":
             return table | {"rearm_gain": None}
@@ -83,7 +83,7 @@ class _IdentifierSwitches(Strict):
     pack_model: bool = Field(
         default=True,
         repr=False,  # not part of the digest of a fleet's settings
-        description="a fit to the pack's history of weeks gives its own OCV curve, capacity and resistances; false: these are the cell file's with the corrections that the filter learns",
+        description="true: OCV curve, capacity and resistances are fitted to weeks of the pack's history; false: they are those of the cell file, with the corrections that the filter learns",
     )
 
 

@@ -78,7 +78,7 @@ class PackValues(Strict):
     )
 
     @model_validator(mode="after")
-    def _full_above_cutoff(self) -> Self:
+    def _check_full_above_cutoff(self) -> Self:
         full_v, cutoff_v = self.full_voltage_v, self.cutoff_voltage_v
         if full_v is not None and cutoff_v is not None and full_v <= cutoff_v:
             raise ValueError(f"full_voltage_v = {full_v:g}: must be above cutoff_voltage_v = {cutoff_v:g}")
@@ -247,7 +247,7 @@ class Settings(Strict):
     @model_validator(mode="before")
     @classmethod
     def _expect_all_batteries(cls, tables: object) -> object:
-        """Set ``sensor.batteries`` to ``pack.parallel``, if the protocol sums the values of as many batteries."""
+        """Set ``sensor.batteries`` to ``pack.parallel``, if the protocol can sum the values of this number of batteries."""
         if not isinstance(tables, dict):
             return tables
         pack, sensor = tables.get("pack"), tables.get("sensor")
@@ -260,7 +260,7 @@ class Settings(Strict):
 
     @property
     def bms_only(self) -> Self | None:
-        """Settings with the device in ``[bms]`` as the only one; None without it."""
+        """Settings whose only device is the one in ``[bms]``; None without this section."""
         if self.bms is None:
             return None
         return self.model_copy(update={"sensor": self.bms.sensor, "source": self.bms.source, "bms": None})
@@ -284,7 +284,7 @@ class Settings(Strict):
 
 
 def load_settings(path: Path) -> Settings:
-    """Read a pack's settings. A file that they name and that is in the folder of the pack file gets this folder.
+    """Read a pack's settings. Relative paths of existing files are relative to the folder of the pack file.
 
     Raises:
         UserError: The file cannot be read or is empty, or a setting is invalid.
@@ -292,11 +292,11 @@ def load_settings(path: Path) -> Settings:
     settings = read_toml(path, Settings)
     if not settings.model_fields_set:
         raise UserError(f"{path}: has no settings; was it cut off? `bms-estimator new` writes a new file")
-    return _with_folder(settings, path.parent)
+    return _resolve_paths(settings, path.parent)
 
 
-def _with_folder(section: Section, folder: Path) -> Section:
-    """Return settings in which each relative path of a file in a folder begins with this folder.
+def _resolve_paths(section: Section, folder: Path) -> Section:
+    """Return settings in which each relative path of a file that exists in ``folder`` begins with ``folder``.
 
     A systemd credential of the same name takes precedence.
     """
@@ -305,7 +305,7 @@ def _with_folder(section: Section, folder: Path) -> Section:
     for key in section.model_fields_set:
         value = getattr(section, key)
         if isinstance(value, BaseModel):
-            changed[key] = _with_folder(value, folder)
+            changed[key] = _resolve_paths(value, folder)
         elif isinstance(value, Path) and (folder / value).is_file() and not os.access(credentials / value, os.R_OK):
             changed[key] = folder / value  # an absolute path remains as it is
     return section.model_copy(update=changed) if changed else section

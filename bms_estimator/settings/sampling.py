@@ -39,7 +39,7 @@ class Sampling:
 
 
 BOARD_GAIN_STD = 0.001
-"""Relative std of the gains of a calibrated board, and of laboratory instruments at the worst."""
+"""Relative std of the gains of a calibrated board, and an upper limit for laboratory instruments."""
 EXACT = Sampling()
 """Sampling with the period of a board and exact gains."""
 BOARD = Sampling(voltage_gain_std=BOARD_GAIN_STD, current_gain_std=BOARD_GAIN_STD)

@@ -114,7 +114,7 @@ class SensorSettings(Strict):
         return settings
 
     @model_validator(mode="after")
-    def _only_boards_have_serials(self) -> Self:
+    def _check_serial(self) -> Self:
         if self.serial and self.protocol != "binary":
             raise ValueError(
                 f"serial: only a binary board reports its serial number, but sensor.protocol is {self.protocol}; remove serial"
@@ -122,7 +122,7 @@ class SensorSettings(Strict):
         return self
 
     @model_validator(mode="after")
-    def _protocol_has_the_address(self) -> Self:
+    def _check_address(self) -> Self:
         addresses = valid_addresses(self.protocol)
         if self.address is None or self.address in addresses:
             return self
@@ -131,7 +131,7 @@ class SensorSettings(Strict):
         raise ValueError(f"address: {self.protocol} has addresses {addresses[0]} to {addresses[-1]}")
 
     @model_validator(mode="after")
-    def _protocol_has_the_batteries(self) -> Self:
+    def _check_batteries(self) -> Self:
         if self.batteries is not None and self.batteries > (limit := max_batteries(self.protocol)):
             raise ValueError(f"batteries: the protocol {self.protocol} has at most {limit}")
         return self

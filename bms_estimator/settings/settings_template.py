@@ -14,7 +14,7 @@ UNITS = {"v": "V", "a": "A", "s": "s", "h": "h", "hz": "Hz", "ah": "Ah", "ohm": 
 """Units by the part of a key after its last underscore."""
 COMMENT_WIDTH = 110
 """Maximum line length of comments."""
-HEAD = """\
+HEADER_COMMENT = """\
 # Settings of one pack. A setting that begins with # has the default value shown; remove the # to change it.
 # A key such as poll_s ends in the unit of its value. Current is positive on discharge.
 """
@@ -32,13 +32,15 @@ def settings_file(model: type[BaseModel], given: GivenSettings = MappingProxyTyp
         model: Model of the whole file; each of its fields is a section.
         given: Settings that are written without ``#``. An optional section is written without ``#`` if it is given.
     """
-    lines = [HEAD]
+    lines = [HEADER_COMMENT]
     for name, field in model.model_fields.items():
         is_optional = field.default is None
         effect_of_omission = f" {_sentence(field.description)}" if is_optional and field.description else ""
         for section in _models(field.annotation):  # [source] has one model for each kind of source
             values = given[name] if name in given and _is_kind(section, given[name]) else {}
-            lines += _comment(f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{effect_of_omission}")
+            lines += _comment_lines(
+                f"{_sentence((section.__doc__ or name).strip().splitlines()[0])}{effect_of_omission}"
+            )
             lines += [f"{'#' if is_optional and not values else ''}[{name}]", *_setting_lines(section, values), ""]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -51,21 +53,23 @@ def _is_kind(section: type[BaseModel], given: Mapping[str, object]) -> bool:
 def _setting_lines(section: type[BaseModel], given: Mapping[str, object]) -> Iterator[str]:
     for name, field in section.model_fields.items():
         key = field.alias or name
-        yield from _comment("  ".join(part for part in (field.description, _unit_and_constraints(key, field)) if part))
+        yield from _comment_lines(
+            "  ".join(part for part in (field.description, _unit_and_constraints(key, field)) if part)
+        )
         if key in given:
-            yield f"{key} = {_toml(given[key])}"
+            yield f"{key} = {_as_toml(given[key])}"
         elif field.examples:  # instead of an empty default
             yield from (f"#{line}" for line in field.examples[0].splitlines())
         else:
             yield f"#{key} = {_default_as_toml(field)}"
 
 
-def _toml(value: object) -> str:
+def _as_toml(value: object) -> str:
     """Return a value as TOML in one line."""
     if isinstance(value, Mapping):
-        return f"{{ {', '.join(f'{key} = {_toml(each)}' for key, each in value.items())} }}"
+        return f"{{ {', '.join(f'{key} = {_as_toml(each)}' for key, each in value.items())} }}"
     if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_toml, value))}]"
+        return f"[{', '.join(map(_as_toml, value))}]"
     return tomlkit.item(value).as_string()
 
 
@@ -86,7 +90,7 @@ def _default_as_toml(field: FieldInfo) -> str:
 def _unit_and_constraints(key: str, field: FieldInfo) -> str:
     """Return unit and constraints, such as ``[V, at least 0]``; empty without unit and constraints."""
     choices, limits = _constraints(field.annotation)
-    limits += [_limit(item) for item in field.metadata if type(item) in _LIMIT_WORDS]
+    limits += [_limit_text(item) for item in field.metadata if type(item) in _LIMIT_WORDS]
     unit = [UNITS[key.rsplit("_", 1)[-1]]] if "_" in key and key.rsplit("_", 1)[-1] in UNITS else []
     one_of = [f"one of {', '.join(choices)}"] if len(choices) > 1 else [f"always {choice}" for choice in choices]
     parts = ", ".join(unit + one_of + limits)
@@ -103,7 +107,7 @@ def _constraints(annotation: Any) -> tuple[list[str], list[str]]:
     if origin is Annotated:
         for constraint in arguments[1:]:  # pydantic's Field keeps its constraints in ``metadata``
             items = getattr(constraint, "metadata", [constraint])
-            limits += [_limit(item) for item in items if type(item) in _LIMIT_WORDS]
+            limits += [_limit_text(item) for item in items if type(item) in _LIMIT_WORDS]
     for inner in arguments[:1] if origin is Annotated else arguments:
         inner_choices, inner_limits = _constraints(inner)
         choices += inner_choices
@@ -111,7 +115,7 @@ def _constraints(annotation: Any) -> tuple[list[str], list[str]]:
     return choices, limits
 
 
-def _limit(constraint: Any) -> str:
+def _limit_text(constraint: Any) -> str:
     attribute, words = _LIMIT_WORDS[type(constraint)]
     return f"{words} {getattr(constraint, attribute):.10g}"
 
@@ -129,5 +133,5 @@ def _sentence(text: str | None) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def _comment(text: str) -> list[str]:
+def _comment_lines(text: str) -> list[str]:
     return textwrap.wrap(text, COMMENT_WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)

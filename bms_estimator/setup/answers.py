@@ -50,7 +50,7 @@ class Answers:
     max_charge_a: float | None = None
     """Largest charge current of the pack [A]; None: no limit is configured."""
     device_soc_std: float | None = None
-    """Std of the device's SOC, with which the pack starts; None: it is not used."""
+    """Std of the device's SOC as initial SOC of the pack; None: this SOC is not used."""
     broker: BrokerLogin | None = None
     """Broker to which the service publishes; None: no broker."""
     found_broker: BrokerLogin | None = None
@@ -65,7 +65,7 @@ class Answers:
 
     @property
     def device_capacity_ah(self) -> float | None:
-        """Capacity of the pack by its device [Ah]; None: it reports none."""
+        """Capacity of the pack that its device reports [Ah]; None: not reported."""
         measured_ah = self.measured.capacity_ah if self.measured else None
         return self.device.capacity_ah if measured_ah is None else measured_ah
 
@@ -76,12 +76,12 @@ class Answers:
         return {section: login for section, login in (("mqtt", self.broker), ("source", source)) if login}
 
     def password_file(self, section: str) -> str:
-        """Return the name of the file beside the settings with the password for the broker of a section."""
+        """Return the name of the file with the password for the broker of a section. It is in the folder of the settings file."""
         return f"{self.name}-{section}.password"
 
     @property
     def tables(self) -> GivenSettings:
-        """Settings of the pack by section and key. The password files are beside the settings."""
+        """Settings of the pack by section and key. The password files are in the folder of the settings file."""
         return self._tables({key: login.settings(self.password_file(key)) for key, login in self.logins.items()})
 
     @property

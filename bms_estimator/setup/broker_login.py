@@ -11,7 +11,7 @@ from urllib.parse import quote, unquote
 
 from bms_estimator.mqtt.broker_config import parse_url
 
-FORM = "mqtt://host:port, or with a login mqtt://user:pw@host; mqtts:// for TLS"
+ADDRESS_FORM = "mqtt://host:port, or with a login mqtt://user:pw@host; mqtts:// for TLS"
 """Form of an address. Characters of the user name may be percent-encoded, because : and @ are separators."""
 _ADDRESS = re.compile(r"(mqtts?://)(?:([^:@/\s]*)(?::(.*))?@)?([^@/\s]+)")
 
@@ -27,14 +27,14 @@ class BrokerLogin:
 
     @classmethod
     def parse(cls, address: str) -> Self:
-        """Return the login in an address of the form ``FORM``. User name and password may be missing.
+        """Return the login in an address of the form ``ADDRESS_FORM``. User name and password may be missing.
 
         Raises:
             ValueError: The address has another form, or its port is invalid. The message does not contain the password.
         """
         match = _ADDRESS.fullmatch(address.strip())
         if match is None:
-            raise ValueError(f"must be {FORM}")
+            raise ValueError(f"must be {ADDRESS_FORM}")
         scheme, username, password, host = match.groups()
         url = f"{scheme}{host}"
         parse_url(url)

@@ -11,8 +11,8 @@ from bms_estimator.setup.broker_login import BrokerLogin
 
 NAME_SEPARATOR = ":"
 """Separator between profile and address in ``FoundDevice.name``."""
-SAME_PACK = 0.02
-"""Maximum difference of the voltages of two devices of one pack, as a fraction."""
+SAME_PACK_TOLERANCE = 0.02
+"""Maximum relative difference between the voltages of two devices of one pack."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class FoundDevice:
     cells: int | None = None
     """Number of cells in series, if the device reports it."""
     voltage_v: float | None = None
-    """Voltage that was received during the search [V]; None: none was received."""
+    """Voltage that was received during the search [V]; None: not received."""
     soc: float | None = None
-    """SOC by the device, 0..1, that was received during the search; None: none was received."""
+    """SOC that the device reported during the search, 0..1; None: not reported."""
     capacity_ah: float | None = None
-    """Capacity from which the device computes its SOC [Ah]; None: none was received."""
+    """Capacity from which the device computes its SOC [Ah]; None: not reported."""
     values: str = ""
     """Values that were received during the search, as text; empty if the search received none."""
     broker: BrokerLogin | None = None
@@ -39,7 +39,7 @@ class FoundDevice:
 
     @property
     def settings(self) -> Settings:
-        """Settings of a pack with this device. All other settings have their defaults, with which nothing is published."""
+        """Settings of a pack with this device. All other settings have their defaults, so that nothing is published."""
         return Settings.model_validate(self.tables_with(self.broker.temporary_settings if self.broker else {}))
 
     def tables_with(self, broker: Mapping[str, object]) -> dict[str, dict[str, Any]]:
@@ -57,7 +57,7 @@ class FoundDevice:
 
 
 def with_pairs(devices: Sequence[FoundDevice]) -> list[FoundDevice]:
-    """Return the devices, and each pair of a battery monitor, such as a shunt, and a BMS that may be of one pack."""
+    """Return the devices, and each pair of a battery monitor, such as a shunt, and a BMS that may belong to one pack."""
     pairs = [
         _pair(a, b) for a in devices for b in devices if b.has_cells and not a.has_cells and _may_be_of_one_pack(a, b)
     ]
@@ -68,7 +68,7 @@ def _may_be_of_one_pack(monitor: FoundDevice, bms: FoundDevice) -> bool:
     """Return True unless the voltages differ, or the devices publish to two brokers."""
     is_one_broker = not (monitor.broker and bms.broker) or monitor.broker == bms.broker
     voltage_v = monitor.voltage_v or bms.voltage_v or 0.0  # an unknown voltage may be that of the other device
-    return is_one_broker and math.isclose(voltage_v, bms.voltage_v or voltage_v, rel_tol=SAME_PACK)
+    return is_one_broker and math.isclose(voltage_v, bms.voltage_v or voltage_v, rel_tol=SAME_PACK_TOLERANCE)
 
 
 def _pair(monitor: FoundDevice, bms: FoundDevice) -> FoundDevice:
@@ -86,7 +86,7 @@ def _pair(monitor: FoundDevice, bms: FoundDevice) -> FoundDevice:
 
 
 def _with_broker(table: Mapping[str, Any], broker: Mapping[str, object]) -> dict[str, Any]:
-    """Return a table of settings, with the settings of a broker if it, or a table in it, is an MQTT source."""
+    """Return a table of settings; each MQTT source in it gets the settings of the broker."""
     inner = {key: _with_broker(each, broker) if isinstance(each, Mapping) else each for key, each in table.items()}
     return {**inner, **broker} if table.get("kind") == "mqtt" else inner
 

@@ -13,7 +13,7 @@ from bms_estimator.setup.found_device import values_text
 from bms_estimator.sources.factory import open_source
 from bms_estimator.sources.source import ReceivedSamples
 
-FIRST_SAMPLE_S = 15.0
+FIRST_SAMPLE_TIMEOUT_S = 15.0
 """Timeout of the first sample [s]. A board needs up to 3 s after its port was opened, a Bluetooth BMS up to 15 s."""
 FIRST_SAMPLE_PERIODS = 2.0
 """Number of sample periods that are added to the timeout of the first sample."""
@@ -29,7 +29,7 @@ class Measurement:
     current_a: float
     """Current [A], positive on discharge."""
     soc: float | None = None
-    """Last SOC that the device reports, 0..1; None: it reports none."""
+    """Last SOC that the device reported, 0..1; None: not reported."""
     capacity_ah: float | None = None
     """Capacity from which the device computes its SOC [Ah]; None: not reported."""
 
@@ -45,9 +45,9 @@ def first_sample_timeout_s(settings: Settings, response_s: float | None = None) 
 
     Args:
         settings: Settings of the source.
-        response_s: Time within which the device answers [s]; None: ``FIRST_SAMPLE_S``.
+        response_s: Time within which the device answers [s]; None: ``FIRST_SAMPLE_TIMEOUT_S``.
     """
-    return (response_s or FIRST_SAMPLE_S) + FIRST_SAMPLE_PERIODS * settings.sensor.sample_period_s
+    return (response_s or FIRST_SAMPLE_TIMEOUT_S) + FIRST_SAMPLE_PERIODS * settings.sensor.sample_period_s
 
 
 async def measure(settings: Settings, response_s: float | None = None) -> Measurement:
@@ -55,7 +55,7 @@ async def measure(settings: Settings, response_s: float | None = None) -> Measur
 
     Args:
         settings: Settings of the source.
-        response_s: Time within which the device answers [s]; None: ``FIRST_SAMPLE_S``.
+        response_s: Time within which the device answers [s]; None: ``FIRST_SAMPLE_TIMEOUT_S``.
 
     Raises:
         UserError: No sample arrives, or none is valid.

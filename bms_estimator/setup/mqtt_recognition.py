@@ -93,13 +93,12 @@ class PublisherRecognition:
         """Return True if most values arrived only as retained messages, others several times, and none was repeated."""
         live = self._live.get(publisher, {})
         repeated = any(a == b for payloads in live.values() for a, b in itertools.pairwise(payloads))
-        often = max((len(live.get(name, ())) for name in ("voltage", "current")), default=0) >= MIN_LIVE_MESSAGES
-        return often and not repeated and len(live) < 0.5 * len(self._values[publisher])
+        is_frequent = max((len(live.get(name, ())) for name in ("voltage", "current")), default=0) >= MIN_LIVE_MESSAGES
+        return is_frequent and not repeated and len(live) < 0.5 * len(self._values[publisher])
 
 
 @functools.cache
 def _templates() -> tuple[_Template, ...]:
-    """Return the topics of all profiles."""
     return tuple(_iter_templates())
 
 

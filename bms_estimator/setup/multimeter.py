@@ -8,7 +8,7 @@ from bms_estimator.setup.answers import InvalidAnswerError
 DISCHARGING, CHARGING = "discharging", "charging"
 """Directions of a current."""
 MAX_DEVIATION = 0.2
-"""Maximum relative deviation of a device from the multimeter. A larger one is a wrong connection or a wrong unit."""
+"""Maximum relative deviation of a device from the multimeter. A larger one indicates a wrong connection or unit."""
 MAX_DISAGREEMENT = 0.01
 """Maximum relative deviation of two comparisons from their common gain."""
 MIN_LOAD_STEPS = 20.0

@@ -15,7 +15,7 @@ from bms_estimator.settings.settings_template import settings_file
 from bms_estimator.setup.answers import Answers
 
 CAPACITY_TOLERANCE = 0.2
-"""Relative difference of the capacity to that of the device without a warning. A worn pack may have a fifth less than rated."""
+"""Maximum relative deviation from the capacity that the device reports. A worn pack may have a fifth less than rated."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class NewPack:
 
 
 def create_pack(file: Path, answers: Answers) -> NewPack:
-    """Check the settings of a pack, and write its settings file, and files with the passwords for brokers beside it.
+    """Check the settings of a pack. Write its settings file, and password files for its brokers to the same folder.
 
     Invalid settings are not written.
 

@@ -1,6 +1,6 @@
 """Questions about a new pack, in the order in which the terminal and the page ask them. Each answer is also an option.
 
-Number of cells in series that fits a measured voltage and a chemistry.
+The number of cells in series is suggested from the measured voltage and the chemistry.
 """
 
 import math
@@ -17,7 +17,7 @@ from bms_estimator.model.cell import generic_cells, load_cell, shipped_cells
 from bms_estimator.model.config_file import error_reason, without_secrets
 from bms_estimator.settings.pack import DEVICE_NAME, PackSettings
 from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
-from bms_estimator.setup.broker_login import FORM, BrokerLogin
+from bms_estimator.setup.broker_login import ADDRESS_FORM, BrokerLogin
 
 BELOW_EMPTY_V, ABOVE_FULL_V = 0.5, 0.3
 """Margins below the OCV at SOC 0, for a load, and above the OCV at SOC 1, for a charger [V]. Both include differences
@@ -46,7 +46,7 @@ def cell_voltages(cell: str) -> CellVoltages:
 
 
 def possible_counts(voltage_v: float, cell: CellVoltages) -> range:
-    """Return the numbers of cells in series with which a pack may have a voltage [V]."""
+    """Return the plausible numbers of cells in series of a pack with this voltage [V]."""
     return range(max(math.ceil(voltage_v / cell.max_v), 1), math.floor(voltage_v / cell.min_v) + 1)
 
 
@@ -88,8 +88,8 @@ NO_BROKER = "none"
 """Answer for a service that publishes nothing over MQTT."""
 NO_LIMIT = "none"
 """Answer for a voltage or current without a configured limit, and for a device whose SOC is not used."""
-DEVICE_SOC_STD = "10"
-"""Default standard deviation of the SOC by a device [%]. Counters of coulombs drift by about as much between two full charges."""
+DEFAULT_DEVICE_SOC_STD = "10"
+"""Default standard deviation of the SOC that a device reports [%], a usual drift of coulomb counters between two full charges."""
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ def _parse_limit_v(key: str, text: str, answers: Answers, *, above_middle: bool)
 
 
 def _suggest_limit_v(answers: Answers, index: int) -> str:
-    """Return the usual voltage limit of the pack, empty before its cells are known; a shipped cell file has its own limits."""
+    """Return the usual voltage limit of the pack; empty before its cells are known. A shipped cell file has its own limits."""
     if answers.cell is None or answers.series is None:
         return ""
     if answers.cell not in USUAL_LIMITS_V:
@@ -237,7 +237,7 @@ def _reports_soc(answers: Answers) -> bool:
 
 
 def _suggest_capacity(answers: Answers) -> str:
-    """Return the capacity of the pack by the device, which is that of a cell unless cells are in parallel."""
+    """Return the capacity that the device reports for the pack, which is that of a cell unless cells are in parallel."""
     return "" if answers.device_capacity_ah is None else f"{answers.device_capacity_ah:g}"
 
 
@@ -339,16 +339,16 @@ QUESTIONS = (
     Question(
         "device_soc_std",
         "How far may the SOC of the device be wrong [%]",
-        f"standard deviation of the SOC by the device, with which the estimate starts [%]; {NO_LIMIT}: it is not used",
+        f"standard deviation of the SOC that the device reports, from which the estimate starts [%]; {NO_LIMIT}: it is not used",
         _parse_device_soc_std,
-        lambda answers: DEVICE_SOC_STD if _reports_soc(answers) else NO_LIMIT,
+        lambda answers: DEFAULT_DEVICE_SOC_STD if _reports_soc(answers) else NO_LIMIT,
         explanation="The estimate starts from this SOC, with the error that you give as its standard deviation.",
         is_asked=_reports_soc,
     ),
     Question(
         "broker",
         "MQTT broker to publish to",
-        f"URL of the MQTT broker to which the service publishes, {FORM}; {NO_BROKER}: no broker",
+        f"URL of the MQTT broker to which the service publishes, {ADDRESS_FORM}; {NO_BROKER}: no broker",
         _parse_broker,
         _suggest_broker,
     ),

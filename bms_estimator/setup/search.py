@@ -22,30 +22,30 @@ from bms_estimator.setup.mqtt_recognition import PublisherRecognition
 from bms_estimator.sources.serial.device_detection import DetectedDevice, probe
 from bms_estimator.sources.serial.port_list import board_ports
 
-LISTEN_S = 12.0
+LISTEN_DURATION_S = 12.0
 """Time for which MQTT messages are received [s]. The publishers with default settings send at least every 10 s."""
-MODBUS_S = 3.0
+MODBUS_TIMEOUT_S = 3.0
 """Time within which a Modbus device sends its first sample [s]. It answers a request within a second."""
 MAX_WAITING = 10_000
 """Maximum number of received messages that wait to be read. A broker sends all retained messages at once."""
 BROKER_HINT = "a broker is searched by mqtt://HOST:PORT"
 """Hint for a place without mqtt://, which is searched as a Modbus device."""
 BLUETOOTH = "bluetooth"
-"""Place that stands for all Bluetooth devices nearby."""
+"""Place that represents all Bluetooth devices nearby."""
 DEFAULT_BROKER = str(MqttSettings.model_fields["url"].default)
 """URL of the broker that is searched by default."""
 
 
 @dataclass
 class SearchResult:
-    """Devices that were found, each alone, and reasons why none was found elsewhere."""
+    """Found devices, and the reasons why other places have none."""
 
     devices: list[FoundDevice] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     """Places without a device, each with the reason."""
     broker: BrokerLogin | None = None
     """Broker that answered; None: no broker."""
-    closed: list[BrokerLogin] = field(default_factory=list)
+    login_required: list[BrokerLogin] = field(default_factory=list)
     """Brokers that require another user name or password."""
 
     @property
@@ -138,7 +138,7 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
                 result.failures.append(f"{url}: not allowed to read #: {denied['#']}")
                 return
             try:
-                async with asyncio.timeout(LISTEN_S):
+                async with asyncio.timeout(LISTEN_DURATION_S):
                     while True:
                         message = await connection.receive()
                         recognition.add_message(message.topic, message.payload, retained=message.retain)
@@ -147,7 +147,7 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
     except LoginError:
         reason = "requires a user name and a password" if login.username is None else "user name or password wrong"
         result.failures.append(f"{url}: {reason}; give them as {url.replace('://', '://user:pw@')}")
-        result.closed.append(login)
+        result.login_required.append(login)
         return
     except BrokerConnectionError as error:
         result.failures.append(f"{url}: {error}")
@@ -155,7 +155,7 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
     found = recognition.devices(login)
     result.devices += found
     if not found:
-        result.failures.append(f"{url}: no message of a known publisher within {LISTEN_S:g} s")
+        result.failures.append(f"{url}: no message of a known publisher within {LISTEN_DURATION_S:g} s")
 
 
 async def _search_modbus_host(place: str, result: SearchResult) -> None:
@@ -191,7 +191,7 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
             f"{profile}{NAME_SEPARATOR}{name}", f"Modbus device {profile} at {name}", {"source": source}
         )
         try:
-            values = await measure(device.settings, MODBUS_S)
+            values = await measure(device.settings, MODBUS_TIMEOUT_S)
         except UserError as error:
             reasons.append(f"{name}: {profile}: {error}")
         else:

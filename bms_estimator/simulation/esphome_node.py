@@ -30,7 +30,7 @@ class SimulatedNode:
         prefix: Name of the node, the first level of its topics.
         speed: Speed relative to real time.
         seed: Seed of the differences between the cells.
-        soc: Function that returns the SOC 0..1 that the BMS shows; None: it shows none.
+        soc: Function that returns the SOC 0..1 that the BMS reports; None: it reports no SOC.
         capacity_ah: Capacity that is configured in the BMS [Ah].
 
     Raises:
@@ -53,14 +53,15 @@ class SimulatedNode:
         self._soc, self._capacity_ah = soc, capacity_ah
         self._deviations_v = _cell_deviations(cells, random.Random(seed))
         self.path = f"{prefix}/sensor/+/state on {', '.join(mqtt.urls)}"
+        """Topics and broker, which texts show in place of the path of a port."""
         self.time_s = 0.0
         """Time of the last reading [s]."""
         self.samples = 0
         self._end_s = 0.0
         will = Message(f"{prefix}/status", b"offline", 1, retain=True)
         # the random part lets several nodes with the same name connect
-        identifier = f"{prefix}-{secrets.token_hex(4)}"
-        options = ConnectOptions(identifier, will, on_message_lost=lambda *_: None)
+        client_id = f"{prefix}-{secrets.token_hex(4)}"
+        options = ConnectOptions(client_id, will, on_message_lost=lambda *_: None)
         self._reconnect_loop = ReconnectLoop(
             brokers(mqtt), options, BrokerConnector(mqtt), self._serve, DeliveryStats()
         )
@@ -92,9 +93,10 @@ class SimulatedNode:
         self._reconnect_loop.closing.set()
 
     async def _publish(self, connection: Connection, states: Mapping[str, str]) -> None:
-        """Publish each state on its topic, retained, as ESPHome does."""
         for topic, text in states.items():
-            await connection.publish(Message(f"{self._prefix}/{topic}", text.encode(), 0, retain=True))
+            await connection.publish(
+                Message(f"{self._prefix}/{topic}", text.encode(), 0, retain=True)
+            )  # as ESPHome does
 
     def _states(self) -> Iterator[tuple[str, str]]:
         """Yield name and text of each sensor of the examples of esphome-jk-bms; the current is positive on charge."""

@@ -36,7 +36,7 @@ class BankCells:
         return cls(capacity_ah * ones, soc * ones, ones, np.inf * ones, 0.0 * ones)
 
     @classmethod
-    def drawn(
+    def random(
         cls,
         rng: np.random.Generator,
         cells: int,

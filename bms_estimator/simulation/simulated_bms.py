@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from enum import Enum
 
-from bms_estimator.simulation.bms_answers import BMS_ANSWERS, MAX_CELLS, Measured
+from bms_estimator.simulation.bms_responses import BMS_RESPONSES, MAX_CELLS, Measured
 from bms_estimator.simulation.simulated_meter import Signal, SimulatedMeter
 from bms_estimator.simulation.virtual_adc import Reading
 
@@ -33,8 +33,8 @@ class SimulatedBms(SimulatedMeter):
     """Simulated BMS on a pseudo-terminal.
 
     Args:
-        protocol: A key of ``BMS_ANSWERS``.
-        signal: The simulated pack.
+        protocol: A key of ``BMS_RESPONSES``.
+        signal: Readings of the simulated pack as a function of time [s].
         cells: Number of cells in series.
         speed: Speed relative to real time.
         soc: Returns the SOC that the BMS reports, 0..1.
@@ -59,7 +59,7 @@ class SimulatedBms(SimulatedMeter):
         if not 1 <= cells <= MAX_CELLS:
             raise ValueError(f"{cells} cells: a simulated BMS has 1 to {MAX_CELLS}")
         super().__init__(signal, speed=speed)
-        self._responses, self._soc, self._capacity_ah = BMS_ANSWERS[protocol], soc, capacity_ah
+        self._responses, self._soc, self._capacity_ah = BMS_RESPONSES[protocol], soc, capacity_ah
         self._random = random.Random(seed)
         deviations_v = [self._random.uniform(-MAX_CELL_DEVIATION_V, MAX_CELL_DEVIATION_V) for _ in range(cells)]
         self._deviations_v = [deviation_v - math.fsum(deviations_v) / cells for deviation_v in deviations_v]
@@ -77,7 +77,7 @@ class SimulatedBms(SimulatedMeter):
         """Return no bytes, because a BMS sends nothing unsolicited."""
         return b""
 
-    def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
+    def respond(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
         """Respond to each request in ``received``, in order."""
         responses, end = b"", 0
         while first := min(

@@ -22,7 +22,7 @@ class SimulatedMeter(ABC):
     """Simulated device on a pseudo-terminal. Open it as a context manager, then ``run`` it.
 
     Args:
-        signal: The simulated pack.
+        signal: Readings of the simulated pack as a function of time [s].
         speed: Speed relative to real time.
     """
 
@@ -58,7 +58,7 @@ class SimulatedMeter(ABC):
     def message(self, reading: Reading) -> bytes:
         """Encode a reading. A device with a finite ``period_s`` sends the message without a request."""
 
-    def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:  # noqa: ARG002 - for polled devices
+    def respond(self, received: bytes, reading: Reading) -> tuple[bytes, int]:  # noqa: ARG002 - for polled devices
         """Return the response to ``received``, and the number of consumed bytes."""
         return b"", len(received)
 
@@ -86,7 +86,7 @@ class SimulatedMeter(ABC):
                     due_s += self.period_s
                     self._send_message(now_s)
                 if inbox:
-                    response, consumed = self.answer(bytes(inbox), self._read_sensors(now_s))
+                    response, consumed = self.respond(bytes(inbox), self._read_sensors(now_s))
                     del inbox[:consumed]
                     self.send(response)
                 has_input.clear()
@@ -134,10 +134,10 @@ class SimulatedVeDirect(SimulatedMeter):
             "FW": "0416",
             "MON": "0",
         }
-        return _block(fields) + _block({"H1": "0", "H2": "0", "H3": "0", "H4": "0"})
+        return _vedirect_block(fields) + _vedirect_block({"H1": "0", "H2": "0", "H3": "0", "H4": "0"})
 
 
-def _block(fields: Mapping[str, str]) -> bytes:
+def _vedirect_block(fields: Mapping[str, str]) -> bytes:
     body = "".join(f"\r\n{label}\t{value}" for label, value in fields.items()).encode() + b"\r\nChecksum\t"
     return body + bytes((-sum(body) & 0xFF,))  # the sum of all bytes of a block is 0 modulo 256
 
@@ -159,7 +159,7 @@ class SimulatedJunctek(SimulatedMeter):
         ]
         return b":r50=1,%d,%s,\r\n" % (sum(values) % 255 + 1, ",".join(map(str, values)).encode())
 
-    def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
+    def respond(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
         """Respond to each line that begins with ``:R50=1,``."""
         *lines, rest = received.split(b"\n")
         requests = sum(line.startswith(b":R50=1,") for line in lines)
@@ -170,7 +170,7 @@ class SimulatedPylontech(SimulatedMeter):
     """Simulated Pylontech console with one battery.
 
     Args:
-        signal: The simulated pack.
+        signal: Readings of the simulated pack as a function of time [s].
         speed: Speed relative to real time.
         cells: Number of cells in series.
     """
@@ -190,7 +190,7 @@ class SimulatedPylontech(SimulatedMeter):
         absent = ["2     -      -      -      -      -      -      -      Absent   -"]
         return _response("pwr", [header, row + "   Normal   Normal   50%      2026-01-01 00:00:00", *absent])
 
-    def answer(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
+    def respond(self, received: bytes, reading: Reading) -> tuple[bytes, int]:
         """Respond to ``pwr`` and ``bat 1``."""
         *lines, rest = received.replace(b"\r", b"\n").split(b"\n")
         response = b"".join(self._command(line.decode("ascii", "replace").strip(), reading) for line in lines)

@@ -12,7 +12,7 @@ FULL_SCALE = 1024
 CLOCK_HZ = 16_000_000
 """Clock of the microcontroller [Hz]."""
 AUX_PER_S = 100
-"""Number of NTC and bandgap readings of the firmware per second, if the sample rate allows as many."""
+"""Number of NTC and bandgap readings of the firmware per second, if the sample rate allows this number."""
 AUX_MAX = 63
 """Maximum number of NTC or bandgap readings in one window, because the firmware sends their sum in 16 bits."""
 CONVERSIONS_PER_S = 8000

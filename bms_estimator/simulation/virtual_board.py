@@ -1,7 +1,4 @@
-"""Simulated sensor board with the firmware's protocol on a pseudo-terminal, and optional faults.
-
-``bms-estimator simulate``, the demo without the firmware's simulator, and tests use it.
-"""
+"""Simulated sensor board with the firmware's protocol on a pseudo-terminal, and optional faults."""
 
 import asyncio
 import contextlib
@@ -109,7 +106,7 @@ class VirtualBoard:
     """Simulated board on a pseudo-terminal. Open it as a context manager, then ``run`` it.
 
     Args:
-        signal: The simulated pack.
+        signal: Readings of the simulated pack.
         rate_hz: Samples per second until the host requests another rate.
         mode: ``text`` prints ``voltage,current,temperature`` lines and takes no commands.
         speed: Speed relative to real time; ``math.inf``: as fast as the host reads.
@@ -283,16 +280,16 @@ class VirtualBoard:
         self._clock_ns += self._period_ns
         self.samples += 1
         self._apply_relay_fallback()
-        message = self._message(reading)
+        message = self._sample_message(reading)
         self._sequence = (self._sequence + 1) % MODULUS
         if len(self._unsent) > _MAX_UNSENT_BYTES and not math.isinf(self.speed):
             self._overrun = True
             return True
         self._overrun = False
-        self._unsent += self._text(message, reading) if self._mode == "text" else self._frame(message)
+        self._unsent += self._text_line(message, reading) if self._mode == "text" else self._frame_with_fault(message)
         return True
 
-    def _message(self, reading: Reading) -> SampleMessage:
+    def _sample_message(self, reading: Reading) -> SampleMessage:
         sums = self._converter.window(reading, self._pair_count)
         status = BoardStatus.AUX_IS_NTC * self._aux_is_ntc + (self._reset_cause << 4)  # the upper half is the cause
         status |= BoardStatus.VOLTAGE_SATURATED * sums.voltage_saturated
@@ -304,7 +301,7 @@ class VirtualBoard:
         board_us = self._clock_ns // 1000 % MODULUS
         return SampleMessage(self._sequence, board_us, sums.voltage, sums.current, sums.pairs, aux, n, int(status))
 
-    def _text(self, message: SampleMessage, reading: Reading) -> bytes:
+    def _text_line(self, message: SampleMessage, reading: Reading) -> bytes:
         """Return the line that a simple Arduino sketch would print."""
         parts = self._converter.parts
         volts_per_step = parts.supply_v / FULL_SCALE / message.count
@@ -315,7 +312,7 @@ class VirtualBoard:
             return b"%.3f,%.3f\r\n" % (voltage_v, current_a)
         return b"%.3f,%.3f,%.1f\r\n" % (voltage_v, current_a, reading.temperature_c)
 
-    def _frame(self, message: SampleMessage) -> bytes:
+    def _frame_with_fault(self, message: SampleMessage) -> bytes:
         """Return the bytes of a sample, changed by the next fault if there is one."""
         frame, delayed, self._delayed_frame = message.encode(), self._delayed_frame, b""
         if not self._faults:
@@ -379,11 +376,11 @@ class VirtualBoard:
             return
         command, body = packet[1], packet[2:]
         if packet[0] != PROTOCOL_VERSION:
-            self._answer(command, AckResult.OTHER_VERSION, PROTOCOL_VERSION)
+            self._send_ack(command, AckResult.OTHER_VERSION, PROTOCOL_VERSION)
         elif command == MessageType.COMMAND_HELLO:
             self.send(self._hello().encode())
         elif command == MessageType.COMMAND_RESTART:
-            self._answer(command, AckResult.OK, 0)
+            self._send_ack(command, AckResult.OK, 0)
             self.reset(ResetCause.WATCHDOG)
         elif command == MessageType.COMMAND_ZERO_CURRENT:
             self._zero_current()
@@ -391,20 +388,20 @@ class VirtualBoard:
             (rate_hz,) = struct.unpack("<H", body)
             if rate_hz in RATE_HZ:
                 self._set_rate(rate_hz)
-            self._answer(command, AckResult.OK if rate_hz in RATE_HZ else AckResult.BAD_VALUE, self._period_ns)
+            self._send_ack(command, AckResult.OK if rate_hz in RATE_HZ else AckResult.BAD_VALUE, self._period_ns)
         elif command == MessageType.COMMAND_SET_RELAY and len(body) == 4:
             self._set_relay(*struct.unpack("<I", body))
         elif command in self._stored and len(body) == 4:
             self._store(MessageType(command), *struct.unpack("<I", body))
         else:
-            self._answer(command, AckResult.UNKNOWN_COMMAND, 0)
+            self._send_ack(command, AckResult.UNKNOWN_COMMAND, 0)
 
     def _store(self, command: MessageType, value: int) -> None:
         """Store the number of a command if it is valid."""
         is_valid = value in _VALID_VALUES[command]
         if is_valid:
             self._stored[command] = value
-        self._answer(command, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._stored[command])
+        self._send_ack(command, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._stored[command])
 
     def _set_relay(self, word: int) -> None:
         """Set the relay from the bits of ``relay_word``. A fallback level needs a delay."""
@@ -419,7 +416,9 @@ class VirtualBoard:
             self.relay_high, self._relay_fallback, self._relay_delay_s = bool(word & 1), fallback, silent_s
             self._relay_command_s = self.time_s
             self._relay_word = word
-        self._answer(MessageType.COMMAND_SET_RELAY, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._relay_word)
+        self._send_ack(
+            MessageType.COMMAND_SET_RELAY, AckResult.OK if is_valid else AckResult.BAD_VALUE, self._relay_word
+        )
 
     def _apply_relay_fallback(self) -> None:
         """Set the relay to its fallback level after the delay without a relay command."""
@@ -427,15 +426,14 @@ class VirtualBoard:
             self.relay_high, self._relay_fallback = self._relay_fallback == RELAY_HIGH, RELAY_KEEP
 
     def _zero_current(self) -> None:
-        """Store the present current as zero."""
         count = compute_window(rate_hz=1)[0]  # the firmware also averages for a second
         zero = self._converter.window(self._reading, count).current / count / FULL_SCALE
         is_valid = abs(zero - 0.5) <= _MAX_ZERO_OFFSET
         self._zero_ppm = round(zero * 1e6) if is_valid else self._zero_ppm
         result = AckResult.OK if is_valid else AckResult.BAD_VALUE
-        self._answer(MessageType.COMMAND_ZERO_CURRENT, result, self._zero_ppm)
+        self._send_ack(MessageType.COMMAND_ZERO_CURRENT, result, self._zero_ppm)
 
-    def _answer(self, command: int, result: AckResult, value: int) -> None:
+    def _send_ack(self, command: int, result: AckResult, value: int) -> None:
         self.send(Ack(command, result, value).encode())
 
     def _flush(self) -> None:

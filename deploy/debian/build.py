@@ -20,7 +20,7 @@ from pathlib import Path
 
 import arm64
 
-from bms_estimator.installation import places
+from bms_estimator.installation import paths
 from bms_estimator.installation.program_copy import (
     DISTRIBUTION,
     PACKAGE,
@@ -170,7 +170,7 @@ Description: real-time estimator for Li-ion battery packs
 """,
         encoding="utf-8",
     )
-    purged = (places.SETTINGS, places.STATE, *map(places.drop_ins, (places.UNIT, places.TEMPLATE)))
+    purged = (paths.SETTINGS, paths.STATE, *map(paths.drop_ins, (paths.UNIT, paths.TEMPLATE)))
     for script in SCRIPTS.iterdir():
         text = script.read_text(encoding="utf-8").replace("@PURGED@", " ".join(map(str, purged)))
         (folder / script.name).write_text(text, encoding="utf-8")

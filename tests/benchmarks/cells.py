@@ -78,7 +78,7 @@ def hours(chemistry: str, seed: int, cycles: int, short_ohm: float = np.inf) -> 
     """Simulate a pack and yield each hour. A short appears after ``HEALTHY_CYCLES``."""
     rng = np.random.default_rng(seed)
     cell = load_cell(chemistry, CAPACITY_AH)
-    drawn = BankCells.drawn(rng, CELLS, CAPACITY_AH, 0.9)
+    drawn = BankCells.random(rng, CELLS, CAPACITY_AH, 0.9)
     drawn = replace(drawn, warmer_k=np.linspace(0.0, WARMER_K, CELLS))
     bank, rates = SimulatedBank(cell, drawn), np.exp(0.3 * rng.standard_normal(CELLS))
     estimator = Estimator(cell.pack(CELLS, 1), voltage_resolution_v=0.01, sampling=BOARD)
@@ -239,7 +239,7 @@ def balanced_scores(chemistry: str, seed: int, current_c: float, *, highest: boo
         highest: True if the balancer drains the cell with the highest SOC, False if it always drains the same cell.
     """
     rng, cell = np.random.default_rng(seed), load_cell(chemistry, BALANCED_AH)
-    bank = SimulatedBank(cell, BankCells.drawn(rng, BALANCED_CELLS, BALANCED_AH, 0.9, soc_std=0.03))
+    bank = SimulatedBank(cell, BankCells.random(rng, BALANCED_CELLS, BALANCED_AH, 0.9, soc_std=0.03))
     model = cell.pack(BALANCED_CELLS, 1)
     estimator = Estimator(model, voltage_resolution_v=0.01, sampling=BOARD)
     estimators, offset_v = CellEstimator(estimator), OFFSET_V * rng.standard_normal(BALANCED_CELLS)

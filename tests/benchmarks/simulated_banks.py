@@ -150,7 +150,7 @@ class RecordedBank:
         rng = self._rng = np.random.default_rng(seed)
         c = CHEMISTRIES[chemistry](rng)
         self._one_c = c.cell.cell.capacity_ah
-        cells = BankCells.drawn(rng, series, self._one_c)
+        cells = BankCells.random(rng, series, self._one_c)
         cells.warmer_k[:] = np.linspace(0.0, rng.uniform(0.0, MAX_GRADIENT_K), series)
         spread = np.exp(FADE_SPREAD * rng.standard_normal((2, series)))
         self._fade, self._growth = rng.uniform(0.0, MAX_FADE) * spread[0], rng.uniform(0.0, MAX_GROWTH) * spread[1]

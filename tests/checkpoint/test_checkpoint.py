@@ -371,7 +371,7 @@ async def test_changes_of_the_soc_are_saved_before_a_long_checkpoint_interval_ha
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first sample and each SOC change of 0.28 % cause a save. The checkpoint interval is 1e6 s."""
-    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 0.01)
     saved: asyncio.Queue[float] = asyncio.Queue()
     loop = asyncio.get_running_loop()
 
@@ -423,7 +423,7 @@ async def test_a_failed_save_is_reported_and_does_not_end_the_loop(tmp_path: Pat
 async def test_a_save_on_a_full_disk_is_not_retried_at_each_change_of_the_soc(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 0.01)
     attempts = []
 
     class FullDiskFile(CheckpointFile):
@@ -449,7 +449,7 @@ async def test_a_save_on_a_full_disk_is_not_retried_at_each_change_of_the_soc(
 
 async def test_an_unchanged_state_is_not_saved_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # health is published often enough to show each save
-    monkeypatch.setattr("bms_estimator.service.publisher.SLOW_S", 0.05)
+    monkeypatch.setattr("bms_estimator.service.publisher.SLOW_INTERVAL_S", 0.05)
     saved_samples = []
 
     class CountingFile(CheckpointFile):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.installation import places
+from bms_estimator.installation import paths
 from bms_estimator.installation.install import system_files
 from bms_estimator.installation.machine import Machine
 
@@ -15,7 +15,7 @@ MAX_EXPOSURE = 1.5
 """Maximum exposure by `systemd-analyze security`, of 0 to 10."""
 
 
-@pytest.fixture(params=[places.UNIT, places.TEMPLATE], ids=["one pack", "several packs"])
+@pytest.fixture(params=[paths.UNIT, paths.TEMPLATE], ids=["one pack", "several packs"])
 def unit(request, tmp_path) -> Path:
     """Return the installed unit of one pack, or an instance of the template, with a program of this machine."""
     texts = {file.path: file.text for file in system_files(Machine(tmp_path), Path(sys.executable))}

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from bms_estimator.doctor.finding import Subject
+from bms_estimator.doctor.finding import ExaminedPack
 from bms_estimator.doctor.systemd_unit import SystemdUnit, parse_units
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.pack import Settings
@@ -36,11 +36,11 @@ CacheDirectory=
 """Output of ``systemctl show`` of systemd 252 for an installed unit and a missing one."""
 
 
-def subject(folder: Path, *, unit: SystemdUnit | None = None, **sections: Any) -> Subject:
+def subject(folder: Path, *, unit: SystemdUnit | None = None, **sections: Any) -> ExaminedPack:
     """Return a pack ``house`` whose state folder is in ``folder``; ``sections`` are further sections of its settings file."""
     pack = {"name": "house", "cell": "lfp", "capacity_ah": 20.0, "series": 4}
     settings = Settings.model_validate({"pack": pack, "state": {"folder": folder / "state"}} | sections)
-    return Subject(folder / "pack.toml", settings, load_cell("lfp", 20.0).pack(4, 1), unit)
+    return ExaminedPack(folder / "pack.toml", settings, load_cell("lfp", 20.0).pack(4, 1), unit)
 
 
 def unit_with(**properties: str) -> SystemdUnit:

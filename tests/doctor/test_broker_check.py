@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.doctor.broker_check import check_broker
 from bms_estimator.doctor.device_check import NOT_EXAMINED, SERIAL_REMEDY
-from bms_estimator.doctor.finding import Finding, Level, Subject
+from bms_estimator.doctor.finding import ExaminedPack, Finding, Level
 from bms_estimator.process.instance_lock import instance_lock
 from tests.doctor.packs import subject
 from tests.free_port import free_port
@@ -29,7 +29,7 @@ def restricted_broker(tmp_path: Path, request: pytest.FixtureRequest) -> Iterato
         yield broker
 
 
-def pack_at(folder: Path, *urls: str) -> Subject:
+def pack_at(folder: Path, *urls: str) -> ExaminedPack:
     return subject(folder, mqtt={"url": list(urls)})
 
 

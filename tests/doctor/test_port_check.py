@@ -10,7 +10,7 @@ from serial.tools import list_ports
 from bms_estimator.doctor import port_check
 from bms_estimator.doctor.finding import Level
 from bms_estimator.doctor.port_check import check_port, may_open
-from bms_estimator.installation import places
+from bms_estimator.installation import paths
 from bms_estimator.sources.serial import port_list
 from tests.doctor.as_user import as_nobody
 from tests.doctor.packs import subject
@@ -75,7 +75,7 @@ def test_the_udev_rule_of_a_usb_port_is_looked_for(
     monkeypatch.setattr(port_list, "BY_ID", tmp_path / "by-id")
     monkeypatch.setattr(port_check, "RULE_FOLDERS", (tmp_path,))
     if is_installed:
-        (tmp_path / places.UDEV_RULE.name).touch()
+        (tmp_path / paths.UDEV_RULE.name).touch()
     _, rule = check_port(subject(tmp_path, sensor={"port": "auto"}))
     assert (rule.check, rule.level) == ("udev rule", level)
 

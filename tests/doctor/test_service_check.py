@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.doctor.finding import Level
-from bms_estimator.doctor.service_check import check_service, describe_unit
+from bms_estimator.doctor.service_check import check_service, unit_finding
 from bms_estimator.doctor.systemd_unit import parse_units
 from bms_estimator.process.instance_lock import instance_lock
 from tests.doctor.packs import SYSTEMCTL_OUTPUT, subject, unit_with
@@ -54,7 +54,7 @@ def test_only_installed_units_count() -> None:
 def test_a_unit_is_described_by_its_state_and_last_run(
     properties: dict[str, str], level: Level, text: str, remedy: str
 ) -> None:
-    finding = describe_unit(unit_with(**properties))
+    finding = unit_finding(unit_with(**properties))
     assert finding.level is level
     assert text in finding.text
     assert remedy in finding.remedy

@@ -15,7 +15,7 @@ from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack
 
 @pytest.mark.parametrize("chemistry", ["nmc", "lfp"])
 def test_deviations_of_the_soc_lie_within_three_std(chemistry: str) -> None:
-    cells = BankCells.drawn(np.random.default_rng(4), CELLS, CAPACITY_AH, 0.9).with_weak_cell(1, capacity_ratio=0.85)
+    cells = BankCells.random(np.random.default_rng(4), CELLS, CAPACITY_AH, 0.9).with_weak_cell(1, capacity_ratio=0.85)
     pack = SimulatedPack(cells, chemistry)
     errors = []
     for _ in range(24):
@@ -39,7 +39,7 @@ def test_std_of_the_soc_is_larger_on_the_plateau_of_lfp() -> None:
 
 
 def test_resistances_of_cells_are_found() -> None:
-    cells = BankCells.drawn(np.random.default_rng(4), CELLS, CAPACITY_AH, 0.9, ohm_std=0.15)
+    cells = BankCells.random(np.random.default_rng(4), CELLS, CAPACITY_AH, 0.9, ohm_std=0.15)
     pack = SimulatedPack(cells)
     pack.run(6)
     assert pack.cells.deviations

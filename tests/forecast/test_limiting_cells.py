@@ -22,7 +22,7 @@ CHARGE = "available_charge_power_10s_w", "available_charge_power_60s_w"
 @pytest.fixture(scope="module")
 def pack() -> SimulatedPack:
     """Return a pack after some hours of use."""
-    pack = SimulatedPack(BankCells.drawn(np.random.default_rng(4), CELLS, CAPACITY_AH, 0.9))
+    pack = SimulatedPack(BankCells.random(np.random.default_rng(4), CELLS, CAPACITY_AH, 0.9))
     pack.run(4)
     return pack
 

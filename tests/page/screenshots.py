@@ -67,7 +67,7 @@ class House:
 
     def __init__(self, days: float, soc: float, hour: float, **settings: Any) -> None:
         self.rng = np.random.default_rng(3)
-        cells = BankCells.drawn(self.rng, CELLS, 0.97 * CAPACITY_AH, soc)
+        cells = BankCells.random(self.rng, CELLS, 0.97 * CAPACITY_AH, soc)
         self.bank = SimulatedBank(load_cell("lfp", CAPACITY_AH), cells)
         self.settings = Settings.model_validate(SETTINGS | settings)
         self.pack = new_pack(self.settings, load_cell("lfp", CAPACITY_AH).pack(CELLS, 1))

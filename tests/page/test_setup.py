@@ -27,7 +27,7 @@ def long_timeouts(monkeypatch):
     """Shorten the wait for a board, and lengthen other timeouts."""
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
-    monkeypatch.setattr("bms_estimator.setup.measurement.FIRST_SAMPLE_S", LONG_S)
+    monkeypatch.setattr("bms_estimator.setup.measurement.FIRST_SAMPLE_TIMEOUT_S", LONG_S)
     expect.set_options(timeout=1e3 * LONG_S)
 
 
@@ -111,7 +111,7 @@ async def page_after(client: ClientSession, server_url: str, path: str, **fields
 
 
 async def test_a_broker_with_a_password_is_searched_after_a_login(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("bms_estimator.setup.search.LISTEN_S", 0.5)
+    monkeypatch.setattr("bms_estimator.setup.search.LISTEN_DURATION_S", 0.5)
     with password_broker(tmp_path) as broker:
         login = {"url": broker.url, "username": "owner"}
         async with SetupServer(loopback(), tmp_path / "pack.toml") as server, ClientSession() as client:

@@ -12,7 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.instance_lock import _name, instance_lock
+from bms_estimator.process.instance_lock import _socket_name, instance_lock
 
 NOBODY = 65534
 """User and group id of ``nobody``, who may not write to the folders of the tests."""
@@ -52,7 +52,7 @@ def test_service_that_does_not_listen_yet_holds_the_lock_until_it_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with socket.socket(socket.AF_UNIX) as starting:
-        starting.bind(_name(tmp_path, "pack"))  # without listen, as in a process that is just starting
+        starting.bind(_socket_name(tmp_path, "pack"))  # without listen, as in a process that is just starting
         with (
             pytest.raises(UserError, match=r"served already, by another process; stop it first$"),
             instance_lock(tmp_path, "pack"),
@@ -91,7 +91,7 @@ def test_symlink_in_place_of_a_lock_file_is_ignored(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can start a process of another user")
 def test_lock_held_by_a_user_who_may_not_write_to_the_folder_is_ignored(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", HOLD_LOCK_SCRIPT, _name(tmp_path, "pack").lstrip("\0"), str(NOBODY)]
+    command = [sys.executable, "-c", HOLD_LOCK_SCRIPT, _socket_name(tmp_path, "pack").lstrip("\0"), str(NOBODY)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe) as holder:
         assert holder.stdout

@@ -52,7 +52,7 @@ async def _assert_files_and_page_open_during_attack(server: PageServer, tmp_path
 async def test_a_client_that_does_not_complete_the_request_header_is_disconnected(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(listener_module, "HEADER_S", 0.05)
+    monkeypatch.setattr(listener_module, "HEADER_TIMEOUT_S", 0.05)
     async with PageServer(PageSettings(listen="127.0.0.1:0"), PackTopics(), HistoryQuery(), retry=False) as server:
         reader, writer = await asyncio.open_connection("127.0.0.1", _port(server))
         writer.write(b"GET / HTTP/1.1\r\nHost: loc")
@@ -83,7 +83,7 @@ async def test_a_client_is_disconnected_if_it_reads_nothing_of_its_response_with
     with connections.serving(transport):
         pass
     transport.write(bytes(8 << 20))  # more than the buffers of the sockets hold
-    (open_connection,) = connections._open.values()
+    (open_connection,) = connections._by_transport.values()
     connections._expire(open_connection)  # the first deadline only records the unsent bytes
     unsent = transport.get_write_buffer_size()
     async with asyncio.timeout(LONG_S):
@@ -111,7 +111,7 @@ async def accepted_connection() -> AsyncIterator[tuple[socket.socket, asyncio.Tr
 
 async def test_failed_accepts_are_logged_once_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
     """All descriptors are in use because their limit is lowered, as if the process had leaked descriptors."""
-    monkeypatch.setattr(listener_module, "RETRY_S", 0.01)
+    monkeypatch.setattr(listener_module, "ACCEPT_RETRY_S", 0.01)
     attempts, original_pause = 0, Listener._pause
 
     def pause(listener: Listener, listening: socket.socket) -> None:

@@ -18,7 +18,7 @@ def test_the_smallest_limit_of_all_control_groups_counts(tmp_path: Path, monkeyp
     for folder, limit in ((group, "9000"), (group.parent, "max"), (tmp_path, "8000")):
         write(folder / "memory.max", f"{limit}\n")
         write(folder / "memory.stat", "anon 3000\nfile 4000\n")
-    limits = memory._available_below(tmp_path, f"/{path}/service", "memory.max", "anon")
+    limits = memory._available_in_parents(tmp_path, f"/{path}/service", "memory.max", "anon")
     assert min(limits) == 5000
 
 

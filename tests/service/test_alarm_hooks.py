@@ -145,7 +145,7 @@ async def test_an_alarm_reported_in_an_earlier_run_is_not_reported_again_and_its
 async def test_an_alarm_that_waits_for_a_program_at_a_restart_is_reported_after_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(alarm_hooks, "CLOSE_S", 0.01)
+    monkeypatch.setattr(alarm_hooks, "CLOSE_TIMEOUT_S", 0.01)
     out = tmp_path / "out"
     script = write_program(tmp_path / "script", f'echo "$BMS_NAME" >> {out}; [ ! -e {tmp_path}/hang ] || sleep 1000')
     (tmp_path / "hang").touch()

@@ -468,7 +468,7 @@ async def test_fewer_cells_in_series_than_measured_before_drop_no_alarm(tmp_path
 async def test_a_raised_alarm_is_saved_without_the_wait_for_the_next_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 1e6)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 1e6)
     settings = edit_settings("state", checkpoint_s=1e6)
     files = StateFiles(tmp_path, settings, CELL)
     async with running(files, settings) as (source, _):
@@ -523,7 +523,7 @@ async def test_an_acknowledgement_during_the_final_save_is_rejected(
 async def test_a_deleted_file_with_alarms_is_written_again_without_samples(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 0.01)
     settings = edit_settings("state", checkpoint_s=1e6)
     files = StateFiles(folder, settings, CELL)
     async with running(files, settings):
@@ -537,7 +537,7 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The checkpoint interval is 1e6 s. The process is killed, which is the same as to read the file before the end."""
-    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
     settings = edit_settings("state", checkpoint_s=1e6)
     blocked = tmp_path / "state"
@@ -554,7 +554,7 @@ async def test_a_raised_alarm_is_saved_at_once_and_again_after_the_disk_was_full
 async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
     folder = tmp_path / "state"
     files = StateFiles(folder, SETTINGS, CELL)
@@ -570,7 +570,7 @@ async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
 
 
 async def test_a_disk_that_hangs_between_two_saves_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "DISK_HUNG_S", 0.01)
     settings, may_continue = edit_settings("state", checkpoint_s=1e6), threading.Event()
     files = StateFiles(tmp_path, settings, CELL)
@@ -586,7 +586,7 @@ async def test_an_alarm_that_is_saved_at_the_second_attempt_is_not_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "RETRY_S", 0.02)
-    monkeypatch.setattr(checkpoint_writer, "CHECK_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 0.01)
     files = StateFiles(tmp_path, SETTINGS, CELL)
     save, failures = files.run_file.save, [OSError(errno.EROFS, "read-only")]
 

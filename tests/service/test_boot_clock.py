@@ -10,7 +10,7 @@ import pytest
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.cell import load_cell
-from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp, synchronised
+from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp, is_clock_synchronized
 from bms_estimator.settings.pack import Settings
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()
@@ -47,7 +47,7 @@ def test_after_a_reboot_the_age_is_infinite_if_the_wall_clock_was_not_synchroniz
 
 def test_the_wall_clock_is_trusted_if_the_kernel_reports_synchronisation() -> None:
     """Compare with ntp_gettime of the C library, which reports it in another way."""
-    assert synchronised() == (ctypes.CDLL(None).ntp_gettime(ctypes.create_string_buffer(128)) != TIME_ERROR)
+    assert is_clock_synchronized() == (ctypes.CDLL(None).ntp_gettime(ctypes.create_string_buffer(128)) != TIME_ERROR)
 
 
 def test_the_boot_time_is_read_from_the_kernel(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,7 +70,7 @@ def test_a_healthy_pack_raises_no_alarm_of_its_cells(chemistry: str) -> None:
 
 def test_a_balancer_that_drains_the_highest_cell_raises_no_alarm_of_a_short() -> None:
     """A balancer drains the highest cell with C/200 while the pack is nearly full."""
-    pack = SimulatedPack(BankCells.drawn(np.random.default_rng(5), CELLS, CAPACITY_AH, 0.9, soc_std=0.03))
+    pack = SimulatedPack(BankCells.random(np.random.default_rng(5), CELLS, CAPACITY_AH, 0.9, soc_std=0.03))
     pack.run(3)
     discharge_a = CAPACITY_AH * 0.2
     for _ in range(6):

@@ -267,7 +267,7 @@ async def test_a_hanging_disk_delays_neither_estimates_nor_shutdown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(checkpoint_writer, "DISK_HUNG_S", 0.01)
-    monkeypatch.setattr(checkpoint_writer, "FINAL_SAVE_S", 0.01)
+    monkeypatch.setattr(checkpoint_writer, "FINAL_SAVE_TIMEOUT_S", 0.01)
     release = threading.Event()
 
     class HungFile(CheckpointFile):

@@ -34,7 +34,7 @@ class Hook:
     def take_all(self) -> str:
         """Take all jobs. Return them as text, in their order."""
         taken = []
-        while job := self.jobs.take():
+        while job := self.jobs.pop():
             taken.append(("+" if job.state == "raised" else "-") + job.alarm.name)
         return " ".join(taken)
 
@@ -69,7 +69,7 @@ def test_a_hook_without_ends_reports_a_second_alarm_if_the_job_of_the_first_was_
 ) -> None:
     hook = Hook("raised")
     hook.change("+a")
-    job = hook.jobs.take()
+    job = hook.jobs.pop()
     assert job is not None
     hook.change(*changes.split())
     hook.jobs.put_back(job)
@@ -83,7 +83,7 @@ def test_a_job_that_was_not_done_is_put_back_only_while_its_alarm_has_not_ended(
 ) -> None:
     hook = Hook(*on)
     hook.change("+a")
-    job = hook.jobs.take()
+    job = hook.jobs.pop()
     assert job is not None
     hook.change(*changes.split())
     hook.jobs.put_back(job)

@@ -54,7 +54,7 @@ hangs = threading.Event()
 os.fsync = lambda _: hangs.wait()
 from bms_estimator.cli.main import main
 from bms_estimator.service import checkpoint_writer
-checkpoint_writer.DISK_HUNG_S = checkpoint_writer.FINAL_SAVE_S = 0.1
+checkpoint_writer.DISK_HUNG_S = checkpoint_writer.FINAL_SAVE_TIMEOUT_S = 0.1
 main()
 """
 """Program whose fsync never returns."""

@@ -11,7 +11,7 @@ from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service import publisher
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.service.pack_service import recording_health
-from bms_estimator.service.service_status import Latency, ServiceStatus
+from bms_estimator.service.service_status import LatencyHistogram, ServiceStatus
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
@@ -144,17 +144,17 @@ async def test_health_contains_the_latency_of_samples_and_the_number_of_waiting_
 
 
 def test_latency_percentiles_are_at_most_a_fifth_too_high() -> None:
-    latency = Latency()
-    assert latency.take() is None
+    latency = LatencyHistogram()
+    assert latency.pop_summary() is None
     for latency_s in [0.002] * 97 + [0.05, 0.05, 0.7]:
         latency.add(latency_s)
-    p50_s, p99_s, max_s = latency.take() or (0.0, 0.0, 0.0)
+    p50_s, p99_s, max_s = latency.pop_summary() or (0.0, 0.0, 0.0)
     assert 0.002 <= p50_s < 0.0024
     assert 0.05 <= p99_s < 0.06
     assert max_s == 0.7
     for latency_s in (-1.0, 0.0, 1e6):  # beyond the range of the percentiles
         latency.add(latency_s)
-    assert latency.take() == pytest.approx((1e-5, 284.0, 1e6), rel=0.5)
+    assert latency.pop_summary() == pytest.approx((1e-5, 284.0, 1e6), rel=0.5)
 
 
 def test_health_contains_the_state_of_a_recording(tmp_path: Path) -> None:

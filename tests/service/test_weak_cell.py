@@ -39,7 +39,7 @@ class Run:
 @pytest.fixture(scope="module")
 def run() -> Run:
     now_s, number, rng, result, sink = 0.0, 0, np.random.default_rng(3), Run([], []), Collector()
-    healthy = BankCells.drawn(rng, SERIES, ONE_C)
+    healthy = BankCells.random(rng, SERIES, ONE_C)
     bank, cell = new_bank(healthy), load_cell("ncr18650").pack(SERIES, 1)
     estimator = Estimator(cell)
     pack = Pack(estimator, SlowFit(estimator, interval_s=FIT_S))

@@ -12,7 +12,7 @@ from tests.patience import LONG_S
 
 async def test_a_modbus_device_is_found_by_the_registers_of_its_profile(monkeypatch) -> None:
     modbus = pytest.importorskip("tests.sources.fieldbus.modbus_device", reason="pymodbus is not installed")
-    monkeypatch.setattr(search_module, "MODBUS_S", LONG_S)
+    monkeypatch.setattr(search_module, "MODBUS_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(search_module, "MODBUS_PROFILES", {"victron-gx": {}})
     registers, port = modbus.Registers({259: 5234, 260: 1200, 261: 0x10000 - 123, 262: 215}), free_port()
     async with modbus.tcp_device(registers, 225, port):
@@ -26,7 +26,7 @@ async def test_a_modbus_device_is_found_by_the_registers_of_its_profile(monkeypa
 async def test_a_broker_without_a_known_publisher_is_reported_and_offered_for_publishing(
     broker: Broker, monkeypatch
 ) -> None:
-    monkeypatch.setattr(search_module, "LISTEN_S", 0.5)
+    monkeypatch.setattr(search_module, "LISTEN_DURATION_S", 0.5)
     result = await search([broker.url])
     assert result.devices == []
     assert result.failures == [f"{broker.url}: no message of a known publisher within 0.5 s"]
@@ -42,7 +42,7 @@ async def test_a_missing_broker_is_reported_with_the_reason() -> None:
 
 async def test_a_host_without_a_scheme_is_reported_with_the_form_of_a_broker(monkeypatch) -> None:
     monkeypatch.setattr(search_module, "MODBUS_PROFILES", {"victron-gx": {}})
-    monkeypatch.setattr(search_module, "MODBUS_S", 0.1)
+    monkeypatch.setattr(search_module, "MODBUS_TIMEOUT_S", 0.1)
     *_, reason = (await search([f"127.0.0.1:{free_port()}"])).failures
     assert reason.endswith("; a broker is searched by mqtt://HOST:PORT")
 

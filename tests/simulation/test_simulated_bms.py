@@ -11,7 +11,7 @@ import pytest
 
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.simulation.bms_answers import BMS_ANSWERS
+from bms_estimator.simulation.bms_responses import BMS_RESPONSES
 from bms_estimator.simulation.simulated_bms import MAX_CELL_DEVIATION_V, BmsFault, SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.captures.raw_capture import make_header
@@ -86,7 +86,7 @@ async def read_bms(
                 await asyncio.gather(*tasks, return_exceptions=True)
 
 
-@pytest.mark.parametrize("name", BMS_ANSWERS)
+@pytest.mark.parametrize("name", BMS_RESPONSES)
 async def test_replay_of_a_bms_with_faults_is_bit_identical_to_the_live_samples(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

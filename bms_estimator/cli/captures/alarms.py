@@ -44,7 +44,7 @@ MAX_BLOCK_S = 1.0
 
 @dataclass
 class RaisedAlarm:
-    """Alarm that was raised; times on the capture's clock [s]."""
+    """Alarm that was raised, with times on the capture's clock [s]."""
 
     alarm: str
     severity: str
@@ -129,10 +129,10 @@ async def _evaluate(settings: Settings, model: PackModel, source: Replay) -> Ala
     latched = {alarm.name for alarm in monitor.report if alarm.latched}
     for alarm in raised_alarms:
         alarm.latched = alarm.ended_s is None and alarm.alarm in latched
-    raised, known = {alarm.alarm for alarm in raised_alarms}, {a.name for a in monitor.report if not a.unknown_reason}
+    raised, evaluated = {each.alarm for each in raised_alarms}, {a.name for a in monitor.report if not a.unknown_reason}
     not_raised = [name for name in monitor.alarms.names() if name not in raised]
-    quiet = [name for name in not_raised if name in known]
-    return AlarmResult(raised_alarms, quiet, unmeasured=[name for name in not_raised if name not in known])
+    quiet = [name for name in not_raised if name in evaluated]
+    return AlarmResult(raised_alarms, quiet, unmeasured=[name for name in not_raised if name not in evaluated])
 
 
 def _pair_changes(changes: list[Change]) -> list[RaisedAlarm]:

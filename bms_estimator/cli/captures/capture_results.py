@@ -84,12 +84,12 @@ def _estimate(pack: Pack, rows: SampleBlock, validation: Validation, progress: P
         UserError: The estimator accepted no sample.
     """
     max_rows = max(ESTIMATE_POINTS * BLOCK_SAMPLES // rows.size, 1)
-    traces, counted = [], []
+    traces, counted_socs = [], []
 
-    def keep(trace: SampleBlock, block_counted: Floats, fraction: float) -> None:
+    def keep(trace: SampleBlock, counted_soc: Floats, fraction: float) -> None:
         kept = _thinned_indices(trace, max_rows)
         traces.append(trace[kept])
-        counted.append(block_counted[kept])
+        counted_socs.append(counted_soc[kept])
         progress(fraction)
 
     estimator, errors = pack.estimator, soc_errors(pack, rows, validation, keep)
@@ -100,7 +100,7 @@ def _estimate(pack: Pack, rows: SampleBlock, validation: Validation, progress: P
     rated_ah = float(estimator.settings["capacity_as"][0]) / 3600.0
     return Estimates(
         {name: trace[name] for name in trace.dtype.names or ()} | {"time_s": trace["time_s"] - first_time_s(rows)},
-        np.concatenate(counted),
+        np.concatenate(counted_socs),
         errors,
         capacity_ah=capacity.value * rated_ah,
         capacity_std_ah=capacity.std * rated_ah,

@@ -95,7 +95,7 @@ def convert(
             return open_capture(path, current_sign=current_sign, column_map=column_map)
 
         print_guesses(path.name, reopen())
-        for block in (_bdf_blocks if is_bdf_name(out.name) else _own_blocks)(reopen, progress, faults):
+        for block in (_bdf_blocks if is_bdf_name(out.name) else _project_blocks)(reopen, progress, faults):
             sink.write(block)
             rows += block.size
         print_warnings(path.name, faults.warnings)
@@ -122,8 +122,10 @@ def _blocks(capture: Capture, progress: Progress, faults: TimeFaults) -> Iterato
         progress(capture.fraction)
 
 
-def _own_blocks(reopen: Callable[[], Capture], progress: Progress, faults: TimeFaults) -> Iterator[NDArray[np.void]]:
-    """Yield the samples of a capture without columns that have no value, which a first pass finds.
+def _project_blocks(
+    reopen: Callable[[], Capture], progress: Progress, faults: TimeFaults
+) -> Iterator[NDArray[np.void]]:
+    """Yield the samples of a capture in this project's columns. A first pass finds the columns without values, which are omitted.
 
     Args:
         reopen: Function that opens the capture for one pass.
@@ -140,7 +142,7 @@ def _own_blocks(reopen: Callable[[], Capture], progress: Progress, faults: TimeF
 def _columns_with_values(capture: Capture) -> tuple[list[str], int]:
     """Return the columns of a capture's samples, and the number of cells with a voltage.
 
-    A file with a status needs all columns, because captures with fewer have no status.
+    A status requires the temperature column, because readers recognize a status only in a table with the columns of a sample.
     """
     *columns, temperature, lowest, highest, status = SAMPLE.names or ()
     has_temperature = has_probes = has_status = False

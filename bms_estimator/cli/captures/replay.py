@@ -57,7 +57,7 @@ from bms_estimator.telemetry.cells import cell_columns
 from bms_estimator.telemetry.health import dropped_text, out_of_range_reason
 from bms_estimator.telemetry.state import CUTOFF_FIELDS, cutoff_text
 
-CELLS_S = 10.0
+CELL_UPDATE_S = 10.0
 """Interval at which the columns of the cells are updated [s]. It equals the averaging window of the cell estimator."""
 RARE_FAULT_FRACTION = 0.01
 """Maximum fraction of samples with a fault for which no likely cause is reported."""
@@ -143,7 +143,6 @@ def replay(
 
 
 def _unread_warnings(source: RawCapture, duration_s: float) -> Iterator[str]:
-    """Yield a warning for each part of a capture that was not read."""
     if source.damaged:
         yield f"damaged after {duration_s:.1f} s; the rest was not read"
     if source.unread_bytes:
@@ -154,7 +153,7 @@ async def _replay(
     settings: Settings, model: PackModel, source: Replay, table: TableSink | None, *, fit_pack: bool
 ) -> ReplayResult:
     """Run the estimator over a source, and pass the estimates to table, summary and broker."""
-    errors: dict[str, str] = {}  # the last text of each kind
+    errors: dict[str, str] = {}  # last error text of each kind of failed fit
     if not fit_pack:
         identifier = settings.identifier.model_copy(update={"pack_model": False})
         settings = settings.model_copy(update={"identifier": identifier})
@@ -211,11 +210,14 @@ class _TableRows:
         self._rows = list[Records]()
 
     def parts(self, received: ReceivedSamples) -> Iterator[ReceivedSamples]:
-        """Yield a block in parts of ``CELLS_S``, after each of which the columns of the cells change; whole without them."""
+        """Split a block into parts of ``CELL_UPDATE_S``, because the columns of the cells change after each part.
+
+        Without these columns, yield the whole block.
+        """
         if self._has_cells is None:
             has_rows = self._table is not None and self._pack.forecaster is not None
             self._has_cells = has_rows and received.cells_v.size > 0
-        changes = np.diff(received.samples["time_s"] // CELLS_S) if self._has_cells else np.zeros(0)
+        changes = np.diff(received.samples["time_s"] // CELL_UPDATE_S) if self._has_cells else np.zeros(0)
         edges = [0, *(np.flatnonzero(changes) + 1).tolist(), received.samples.size]
         for begin, end in itertools.pairwise(edges):
             part = slice(begin, end)
@@ -264,7 +266,7 @@ def result_table(title: str, result: ReplayResult) -> Table:
         "samples": f"{result.samples:,}",
         "dropped": _dropped_text(result),
         **({"gaps": f"{result.gaps:,}"} if result.gaps else {}),
-        **({"clock set back": _set_back_text(result)} if result.time_steps_back else {}),
+        **({"clock set back": _clock_steps_text(result)} if result.time_steps_back else {}),
         "duration": _number_text(result.duration_s, ",.1f", "s"),
         **(_soc_rows(result) if has_soc else {}),
         "innovation, RMS": _number_text(result.innovation_rms_v, ".3f", "mV", 1e3),
@@ -335,7 +337,7 @@ def _temperature_row(result: ReplayResult) -> dict[str, str]:
     return {"temperature": dropped} if result.temperatures_dropped else {}
 
 
-def _set_back_text(result: ReplayResult) -> str:
+def _clock_steps_text(result: ReplayResult) -> str:
     """Return the number of backward steps of the clock, with the likely cause if there are many."""
     text = f"{result.time_steps_back:,} times"
     is_frequent = result.time_steps_back > RARE_FAULT_FRACTION * result.samples

@@ -30,7 +30,7 @@ class LearnedParameter:
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """ReplayResult of a replay; None for missing numbers."""
+    """Result of a replay; None for missing numbers."""
 
     samples: int
     """Number of accepted samples."""
@@ -39,7 +39,7 @@ class ReplayResult:
     soc_initial: float | None
     soc_final: float | None
     soc_std_final: float | None
-    """Standard deviation by the identifier; None if the identifier is off."""
+    """Standard deviation that the identifier estimates; None if the identifier is off."""
     soc_rms_difference_to_coulomb: float | None
     innovation_rms_v: float | None
     """RMS of measured minus predicted voltage, before the correction by the measurement. Without the identifier, that of the observer."""
@@ -72,7 +72,7 @@ class ReplayResult:
     delta_2: float | None
     """SOC below which C_tl is negative, (2.12)."""
     stability_margin: float | None
-    """SOC at the end minus the larger of both; None where ``stability_margin_reason`` has a reason, and for a fuel cell."""
+    """SOC at the end minus the larger of both deltas; None if ``stability_margin_reason`` is set, and for a fuel cell."""
     stability_margin_std: float | None
     stability_margin_reason: str | None
     capacity_ah: float | None
@@ -86,11 +86,11 @@ class ReplayResult:
     forecast: dict[str, float | None]
     """Values of a forecast from the last sample; empty without a forecaster."""
     forecast_reason: str | None
-    """Reason why this forecast has no time to the cut-off; None if it has one, or without a forecaster."""
+    """Reason why ``forecast`` has no time to the cut-off; None if it has one, or without a forecaster."""
     weakest_cell: int | None
     """Number of the cell with the lowest SOC at the end, from 1; None without cell voltages."""
     weakest_cell_soc: float | None
-    """SOC of this cell, 0..1."""
+    """SOC of the weakest cell, 0..1."""
     weakest_cell_soc_std: float | None
     cell_soc_spread: float | None
     """Highest less lowest SOC of the cells."""

@@ -233,7 +233,7 @@ def report_on_captures(
         soc: SOC at the first sample of each capture, 0..1; None: from the voltage.
         series: Number of cells in series; None: the number in the settings.
         temperature_c: Temperature of captures without a sensor [°C]; None: the default of the model.
-        verdict: Verdict of the calibration that made the cell file; None: by the captures.
+        verdict: Verdict of the calibration that made the cell file; None: judge by the captures.
     """
     settings, pack_model = pack_or_cell(pack, cell, capacity_ah, series)
     model = pack_model.battery(f"{pack_model.cell.name} is a fuel cell: report needs a battery")

@@ -105,7 +105,6 @@ def _load_recorded(
 
 
 def _print_items(console: Console, report: Report) -> None:
-    """Print the tables, and the titles of the figures, of a report."""
     for item in report.items:
         if isinstance(item, report_items.Table):
             printed = Table(title=f"{report_items.name(item)}  {item.title}", title_justify="left", box=box.SIMPLE_HEAD)

@@ -106,19 +106,19 @@ def _residuals(validation: Validation) -> Records:
 
 
 def _json_result(validation: Validation, verdict: Verdict) -> dict[str, Any]:
-    above = {f"{key}_soc_above_0_1": value for key, value in _errors(validation.above).items()}
+    above = {f"{key}_soc_above_0_1": value for key, value in _errors_as_json(validation.above).items()}
     return (
-        _errors(validation.all)
+        _errors_as_json(validation.all)
         | above
         | {
             "initial_soc": validation.initial_soc,
             "initial_soc_from": validation.initial_soc_from,
             "final_soc": validation.final_soc,
             "glitches": validation.glitches,
-            "resting": _errors(validation.resting),
-            "loaded": _errors(validation.loaded),
+            "resting": _errors_as_json(validation.resting),
+            "loaded": _errors_as_json(validation.loaded),
             "extra_series_resistance_ohm": finite(validation.extra_ohm),
-            "with_extra_series_resistance": _errors(validation.with_extra_ohm),
+            "with_extra_series_resistance": _errors_as_json(validation.with_extra_ohm),
             "grade": verdict.grade,
             "verdict": verdict.text,
             "warnings": list(validation.warnings),
@@ -126,7 +126,7 @@ def _json_result(validation: Validation, verdict: Verdict) -> dict[str, Any]:
     )
 
 
-def _errors(errors: Errors) -> dict[str, Any]:
+def _errors_as_json(errors: Errors) -> dict[str, Any]:
     return {
         "samples": errors.samples,
         "voltage_rms_mv": finite(1e3 * errors.voltage_rms_v),

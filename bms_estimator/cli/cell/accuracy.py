@@ -1,4 +1,4 @@
-"""``bms-estimator accuracy``: how well the SOC of a pack can be known in its use, and which change helps most."""
+"""``bms-estimator accuracy``: how accurately the SOC of a pack can be estimated in its use, and which change helps most."""
 
 import json
 import math
@@ -66,7 +66,7 @@ def accuracy(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compute how well the SOC of a pack can be known, and which change of its use or equipment helps most.
+    """Compute how accurately the SOC of a pack can be estimated, and which change of its use or equipment helps most.
 
     The result is a lower bound: the std that remains however long the estimator runs, if it knows only the cell file.
     On average over the cells that the file describes, no estimator has a smaller error.
@@ -81,7 +81,7 @@ def accuracy(
         window = Window(0.0, has_temperature=False)
     else:
         compile_ahead()
-        window, present_std, full_charges = _use_of_pack(settings, model)
+        window, present_std, full_charges = _window_of_pack(settings, model)
     if between is not None:
         window = _with_ends(window, *between)
     elif window.high - window.low < MIN_WINDOW:
@@ -109,7 +109,7 @@ def _with_ends(window: Window, low: float, high: float) -> Window:
     return replace(window, low=low / 100.0, high=high / 100.0, full=high == 100.0, charge_seen=True)
 
 
-def _use_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, int]:
+def _window_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, int]:
     """Return the window of a pack's history, the std of its SOC, and its number of full charges.
 
     Without a history the window is empty.
@@ -130,7 +130,6 @@ def _use_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float, i
 
 
 def _print(result: AccuracyResult) -> None:
-    """Print the result as a table."""
     full = "" if result.full_charges is None else f", {result.full_charges} full charges"
     sensor = "" if result.has_temperature else ", no temperature sensor"
     typer.echo(f"SOC {result.low:.0%} to {result.high:.0%}{full}{sensor}")

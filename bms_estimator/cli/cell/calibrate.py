@@ -1,4 +1,4 @@
-"""``bms-estimator calibrate``: cell file from captures of any kind, or from a guided test beside a pack.
+"""``bms-estimator calibrate``: cell file from captures of any kind, or from a guided test of a pack.
 
 It prints tables or JSON, and writes comments into the cell file.
 """

@@ -1,4 +1,4 @@
-"""Calibration beside a pack: reads samples, shows the screen of a guided test, and switches the load within the pack's limits."""
+"""Guided test of a connected pack: reads samples, shows the screen, and switches the load within the pack's limits."""
 
 import asyncio
 import math
@@ -163,7 +163,7 @@ class RelayOptions:
 
 
 def run_guided_test(settings: Settings, pack: CellModel, session: Session, relay: RelayOptions) -> Columns | None:
-    """Run a guided test beside a pack, or continue an interrupted one.
+    """Run a guided test of a connected pack, or continue an interrupted one.
 
     Returns:
         The capture of the finished test, from the rest of the full pack on; None if a signal ended the test.
@@ -230,7 +230,7 @@ class _LiveTest:
     ) -> None:
         self._settings, self._test, self._recording, self._relay = settings, test, recording, relay
         self._end_s, self._last_arrival_s = end_s, last_arrival_s
-        self._connected, self._done = asyncio.Event(), asyncio.Event()
+        self._has_samples, self._done = asyncio.Event(), asyncio.Event()
         self._block_s = -math.inf  # monotonic time of the last block
         self._switch: LoadSwitch | None = None
 
@@ -287,7 +287,7 @@ class _LiveTest:
             samples["time_s"] += shift_s
             self._test.feed(samples, received.cells_v)
             self._block_s = time.monotonic()
-            self._connected.set()
+            self._has_samples.set()
             self._request_load()
             if self._test.is_done:
                 self._done.set()
@@ -301,7 +301,7 @@ class _LiveTest:
 
     async def _drive_switch(self) -> None:
         """Send the state of the load from the first samples on."""
-        await self._connected.wait()
+        await self._has_samples.wait()
         if self._switch is None:
             await asyncio.Event().wait()
         else:
@@ -309,7 +309,7 @@ class _LiveTest:
 
     async def _show(self, console: Console, source: SerialSource | LineSource, log: deque[str]) -> None:
         """Show the screen on a terminal, otherwise a line whenever the instruction changes."""
-        shown = ""
+        printed_text = ""
         with Live(console=console, auto_refresh=False, transient=True) as live:
             while True:
                 self._request_load()
@@ -317,8 +317,8 @@ class _LiveTest:
                     console.print(Text.from_ansi(log.popleft()))
                 if console.is_terminal:
                     live.update(build_screen(self._test, source.silence_reason), refresh=True)
-                elif (text := instruction_text(self._test)) != shown:
-                    shown = text
+                elif (text := instruction_text(self._test)) != printed_text:
+                    printed_text = text
                     line = f"{text} [{measured_text(self._test)}; {remaining_text(self._test)}]"
                     console.print(line, markup=False, soft_wrap=True)
                 await asyncio.sleep(REDRAW_S)

@@ -1,4 +1,4 @@
-"""Files of a calibration beside a pack: its recordings, and a small state file that names them."""
+"""Files of a guided test: its recordings, and a small state file that names them."""
 
 import gzip
 import json
@@ -19,7 +19,7 @@ from bms_estimator.sources.captures.replay import RawCapture
 
 @dataclass(frozen=True)
 class Session:
-    """Calibration in progress.
+    """Guided test in progress.
 
     Attributes:
         folder: Folder of the recordings.

@@ -47,7 +47,7 @@ class AnchorResult:
     soc_std: float
     counted_ah: float
     off: float
-    """SOC by the rest's voltage minus SOC by the counted charge."""
+    """SOC from the rest's voltage minus SOC from the counted charge."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
 from bms_estimator.cli.options.capture_options import Force, check_output_file
-from bms_estimator.cli.options.table import counted
+from bms_estimator.cli.options.table import count_text
 from bms_estimator.model.cell_voltage_columns import cell_voltage_columns
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
@@ -79,7 +79,7 @@ def capture(
             rows += samples.size
     first_s, last_s = fetched.span_s
     typer.echo(
-        f"{out}: {counted(rows, 'sample')} in {counted(fetched.blocks, 'block')} of {pack}, {iso_utc(first_s)} to {iso_utc(last_s)}"
+        f"{out}: {count_text(rows, 'sample')} in {count_text(fetched.blocks, 'block')} of {pack}, {iso_utc(first_s)} to {iso_utc(last_s)}"
     )
     for line in _warnings(fetched, since_s):
         typer.echo(f"warning: {pack}: {line}", err=True)
@@ -120,7 +120,7 @@ def _warnings(fetched: "BlockCapture", since_s: float) -> list[str]:
     if fetched.missing:
         gaps = ", ".join(f"{a} to {b}" if b > a else f"{a}" for a, b in fetched.missing[:MAX_SHOWN_GAPS])
         more_count = len(fetched.missing) - MAX_SHOWN_GAPS
-        more = f" and {counted(more_count, 'more gap')}" if more_count > 0 else ""
+        more = f" and {count_text(more_count, 'more gap')}" if more_count > 0 else ""
         lines.append(f"missing blocks: {gaps}{more}; they are lost, or the edge has yet to send them again")
     if fetched.damaged:
         lines.append(f"damaged messages, which were skipped: {fetched.damaged}")

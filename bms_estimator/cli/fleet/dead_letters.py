@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.table import counted, print_table
+from bms_estimator.cli.options.table import count_text, print_table
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
@@ -45,8 +45,8 @@ def replay(
     an upgrade. A block that killed workers was skipped, and is not processed later.
     """
     count, names = asyncio.run(_replay((server, creds, ca), set(packs or ())))
-    packs_text = f"{counted(len(names), 'pack')}: {', '.join(sorted(names))}"
-    typer.echo(f"replayed {counted(count, 'block')} of {packs_text}" if count else "none")
+    packs_text = f"{count_text(len(names), 'pack')}: {', '.join(sorted(names))}"
+    typer.echo(f"replayed {count_text(count, 'block')} of {packs_text}" if count else "none")
 
 
 def _row(letter: "DeadLetter") -> tuple[object, ...]:

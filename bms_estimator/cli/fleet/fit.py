@@ -15,7 +15,7 @@ def fit(
     ca: Ca = None,
     processes: Annotated[int, typer.Option(parser=whole(1), help="number of fits that run in parallel")] = 1,
 ) -> None:
-    """Fit the models of packs to their histories, at the requests of the workers, until SIGINT, SIGTERM or SIGHUP.
+    """Fit the models of packs to their histories, on request of the workers, until SIGINT, SIGTERM or SIGHUP.
 
     Each fit takes about a second of one CPU. With too few processes, fits are late.
     """

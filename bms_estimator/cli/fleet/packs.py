@@ -10,7 +10,7 @@ import tomlkit
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.table import counted
+from bms_estimator.cli.options.table import count_text
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.csv_table import CELL_FILE_SUFFIX, PackTable, check_models, read_table, table_lines
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
@@ -182,8 +182,8 @@ async def _load(path: Path, table: PackTable, files: dict[str, str], address: Se
     }
     changes = [f"{count} {change}" for change, count in counts.items() if count]
     if written := cells.new + cells.changed:
-        changes.append(f"{counted(written, 'cell file')} written")
-    return f"{path}: {counted(len(rows), 'pack')} of {counted(spec_count, 'kind')}: {', '.join(changes)}"
+        changes.append(f"{count_text(written, 'cell file')} written")
+    return f"{path}: {count_text(len(rows), 'pack')} of {count_text(spec_count, 'kind')}: {', '.join(changes)}"
 
 
 def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> None:
@@ -200,7 +200,7 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
         with only_collector(folder):  # before anything is erased
             _print_erasures(asyncio.run(_erase_from_server(packs, address)))
             try:
-                typer.echo(f"{folder}: {counted(erase_rows(folder, packs), 'row')} erased")
+                typer.echo(f"{folder}: {count_text(erase_rows(folder, packs), 'row')} erased")
             except OSError as error:
                 raise UserError(f"--folder {folder}: cannot be written, repeat the command: {error.strerror}") from None
     remaining: list[str] = []
@@ -227,9 +227,9 @@ async def _erase_from_server(packs: list[str], address: ServerAddress) -> "dict[
 def _print_erasures(erasures: "dict[str, Erasure]") -> None:
     for pack, erasure in erasures.items():
         typer.echo(
-            f"{pack}: {counted(erasure.blocks, 'block')}, {counted(erasure.dead_letters, 'dead letter')}, "
-            f"{counted(erasure.hours, 'hourly summary', 'hourly summaries')} and "
-            f"the state in {counted(erasure.checkpoints, 'checkpoint')} erased"
+            f"{pack}: {count_text(erasure.blocks, 'block')}, {count_text(erasure.dead_letters, 'dead letter')}, "
+            f"{count_text(erasure.hours, 'hourly summary', 'hourly summaries')} and "
+            f"the state in {count_text(erasure.checkpoints, 'checkpoint')} erased"
         )
         for stream, count in erasure.remaining.items():
             typer.echo(f"{pack}: remaining messages in the stream {stream}: {count}")

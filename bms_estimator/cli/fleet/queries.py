@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.table import counted, print_table
+from bms_estimator.cli.options.table import count_text, print_table
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def repair(
     if not folder.is_dir():
         raise UserError(f"--folder {folder}: no such folder")
     with only_collector(folder):
-        typer.echo(f"{folder}: {counted(repair_arrivals(folder), 'row')} repaired")
+        typer.echo(f"{folder}: {count_text(repair_arrivals(folder), 'row')} repaired")
 
 
 def ask(

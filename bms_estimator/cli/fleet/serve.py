@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import TypeAdapter, ValidationError
 
-from bms_estimator.cli.options.table import counted
+from bms_estimator.cli.options.table import count_text
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts
@@ -119,7 +119,7 @@ def users(
     """Write the tokens of the edges of all packs of a table, as `fleet user` prints them one by one."""
     packs = read_table(table).packs
     credentials.write_tokens(out, _edge_tokens(tenant, packs, settings_file, folder, days))
-    typer.echo(f"{out}: {counted(len(packs), 'token')} written; keep them secret")
+    typer.echo(f"{out}: {count_text(len(packs), 'token')} written; keep them secret")
 
 
 def _edge_tokens(

@@ -22,8 +22,7 @@ from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
 
 PAST_BLOCKS = 30 * 24 * 60
-"""Number of blocks by which the first sample is before the present, if packs are faster than real time and the number of blocks is
-not limited. It is 30 days."""
+"""Number of blocks before the present at which packs faster than real time begin by default: 30 days."""
 MAX_PACKS = 999_999
 """Maximum number of packs, because their names end in a number of six digits."""
 
@@ -108,7 +107,6 @@ def _begin_ns(begin: datetime | None, speed: float, blocks: int | None) -> int:
 
 
 def _valid_prefix(prefix: str) -> str:
-    """Return a prefix after checking that it gives valid pack names."""
     try:
         return TypeAdapter(DeviceName).validate_python(prefix)
     except ValidationError:

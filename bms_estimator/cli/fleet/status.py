@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
-from bms_estimator.cli.options.table import counted, print_table
+from bms_estimator.cli.options.table import count_text, print_table
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
     from bms_estimator.fleet.heartbeat import Heartbeat
     from bms_estimator.fleet.nats.dead_packs import DeadPacks
 
-STREAMS_S = 10.0
+STREAMS_TIMEOUT_S = 10.0
 """Timeout of the requests to the streams [s]."""
 MIN_CLOCKS = 2
 """Number of packs of a worker above which errors of most clocks prove that the server's clock is wrong."""
@@ -54,7 +54,6 @@ def status(
 
 
 def _refusals(heartbeat: "Heartbeat") -> list[str]:
-    """Return a line for each partition that a worker refuses."""
     return [
         f"partition {each.partition}: {heartbeat.id} refuses it, because its checkpoint is of format "
         f"{each.format or 'unknown'}: start a worker of the version that wrote it"
@@ -70,7 +69,7 @@ def _unknown_packs(heartbeat: "Heartbeat") -> list[str]:
         for pack in heartbeat.unknown
     ]
     more = heartbeat.unknown_count - len(lines)
-    return [*lines, f"{heartbeat.id}: {counted(more, 'more unknown pack')}"] if more > 0 else lines
+    return [*lines, f"{heartbeat.id}: {count_text(more, 'more unknown pack')}"] if more > 0 else lines
 
 
 def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
@@ -79,13 +78,13 @@ def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
         f"{pack}: dead letter: {reason}; `fleet dead-letters list` lists all" for pack, reason in dead_packs.reasons
     ]
     more = dead_packs.packs - len(lines)
-    return [*lines, f"{counted(more, 'more pack')} with dead letters"] if more else lines
+    return [*lines, f"{count_text(more, 'more pack')} with dead letters"] if more else lines
 
 
 def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
     """Return a line for each listed pack whose edge's clock is wrong, the largest error first."""
     if 2 * heartbeat.clock_error_count > heartbeat.packs > MIN_CLOCKS:
-        clocks = counted(heartbeat.clock_error_count, "edge")
+        clocks = count_text(heartbeat.clock_error_count, "edge")
         return [
             f"{heartbeat.id}: the clocks of {clocks} of {heartbeat.packs} differ from the server's: check the clocks of its nodes"
         ]
@@ -96,7 +95,7 @@ def _clock_errors(heartbeat: "Heartbeat") -> list[str]:
         for pack, error_s in largest
     ]
     more = heartbeat.clock_error_count - len(largest)
-    return [*lines, f"{heartbeat.id}: {counted(more, 'more pack')} with a wrong clock"] if more > 0 else lines
+    return [*lines, f"{heartbeat.id}: {count_text(more, 'more pack')} with a wrong clock"] if more > 0 else lines
 
 
 def _row(heartbeat: "Heartbeat") -> tuple[object, ...]:
@@ -133,7 +132,7 @@ async def _stream_lines(address: ServerAddress) -> list[str]:
 
     async with connected(*address) as nc:
         try:
-            async with asyncio.timeout(STREAMS_S):
+            async with asyncio.timeout(STREAMS_TIMEOUT_S):
                 partitions = await partitions_of(nc)
                 if partitions is None:
                     return ["the server has no streams yet: was `fleet serve` started?"]

@@ -63,7 +63,7 @@ def demo(
     compile_ahead()
     load_kernels()
     with flush_logs():
-        totals = asyncio.run(
+        summary = asyncio.run(
             run_demo(
                 rate_hz=rate_hz,
                 speed=speed,
@@ -75,7 +75,7 @@ def demo(
                 opened=open_browser if browser else _ignore_url,
             )
         )
-    typer.echo(totals)
+    typer.echo(summary)
 
 
 def _ignore_url(_url: str) -> None:

@@ -11,12 +11,12 @@ import structlog
 import typer
 
 from bms_estimator.cli.options.pack_options import with_sensor
-from bms_estimator.cli.options.port_options import OtherPort
+from bms_estimator.cli.options.port_options import PortOverride
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.process.log_setup import configure_logs, flush_logs, set_level
-from bms_estimator.process.signals import startup_signals, stop_on_signal
+from bms_estimator.process.signals import exit_on_startup_signals, stop_on_signal
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
@@ -31,7 +31,7 @@ SOURCE_HUNG_S = 30.0
 """Time after which a source whose task has not run counts as hung [s]."""
 MAX_WATCHDOG_S = 5.0
 """Maximum interval between two watchdog notifications [s]."""
-REPORT_S = 3600.0
+REPORT_INTERVAL_S = 3600.0
 """Interval between two log lines about the blocks [s]."""
 
 log = structlog.get_logger(__name__)
@@ -45,8 +45,8 @@ async def serve_edge(
     Args:
         settings: The pack's settings, with ``[edge]``.
         folder: Folder of the blocks.
-        stop: Event that ends the service; signals set it, too.
-        notifier: Is notified that the loop is ready and alive.
+        stop: Event that ends the service. Signals also set it.
+        notifier: Notifies systemd that the loop is ready and alive.
 
     Raises:
         UserError: A setting cannot be used.
@@ -73,7 +73,6 @@ async def serve_edge(
 
 
 async def _send_samples(source: Source, sender: BlockSender) -> None:
-    """Pass all samples of the source to the block sender."""
     async for received in source:
         sender.take(received.samples, received.cells_v)
         await asyncio.sleep(0)  # a source that always has samples must not starve the sender
@@ -100,9 +99,8 @@ async def _notify_alive(
 
 
 async def _log_blocks(sender: BlockSender) -> None:
-    """Log the state of the blocks at intervals."""
     while True:
-        await asyncio.sleep(REPORT_S)
+        await asyncio.sleep(REPORT_INTERVAL_S)
         log.info("blocks of samples", **sender.health().model_dump())
 
 
@@ -110,7 +108,7 @@ def edge(
     pack: Annotated[Path, typer.Argument(help="settings file of the pack, with a section \\[edge]")] = Path(
         "pack.toml"
     ),
-    port: OtherPort = None,
+    port: PortOverride = None,
 ) -> None:
     """Send a pack's raw samples to a fleet server until SIGINT, SIGTERM or SIGHUP.
 
@@ -119,5 +117,5 @@ def edge(
     """
     settings = with_sensor(load_settings(pack), port=port)
     configure_logs()
-    with startup_signals(), flush_logs():
+    with exit_on_startup_signals(), flush_logs():
         asyncio.run(serve_edge(settings, state_folder(settings)))

@@ -209,7 +209,6 @@ def _trip(
 def _result_table(
     start: SavedPack, cutoff_v: float, load: str, forecast: Forecast, outcome: TripOutcome | None
 ) -> Table:
-    """Return the result as a table."""
     table = Table(title=start.name, title_justify="left", show_header=False, box=box.SIMPLE_HEAD)
     table.add_column(style="dim")
     table.add_column()

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from bms_estimator.cli.options.number_options import decimal, whole
 from bms_estimator.cli.options.pack_options import load_pack, with_sensor
-from bms_estimator.cli.options.port_options import OtherPort
+from bms_estimator.cli.options.port_options import PortOverride
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.log_setup import configure_logs, flush_logs
 from bms_estimator.process.signals import stop_on_signal
@@ -39,7 +39,7 @@ def record(
             show_default=False,
         ),
     ] = None,
-    port: OtherPort = None,
+    port: PortOverride = None,
     baud: Annotated[
         int | None, typer.Option(parser=whole(1200), help="baud rate that replaces sensor.baud of the settings")
     ] = None,

@@ -14,11 +14,11 @@ import typer
 
 from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
-from bms_estimator.cli.options.port_options import OtherPort
+from bms_estimator.cli.options.port_options import PortOverride
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.log_setup import configure_logs, flush_logs
-from bms_estimator.process.signals import startup_signals
+from bms_estimator.process.signals import exit_on_startup_signals
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.service.pack_service import run_pack_service, run_pack_services
@@ -33,7 +33,7 @@ def run(
     packs: Annotated[
         list[Path] | None, typer.Argument(help="settings files, one for each pack", show_default="pack.toml")
     ] = None,
-    port: OtherPort = None,
+    port: PortOverride = None,
     mqtt: Annotated[
         str | None, typer.Option(help="MQTT broker that replaces mqtt.url of the settings, mqtt://host:port")
     ] = None,
@@ -53,7 +53,7 @@ def run(
     paths = packs or [Path("pack.toml")]
     apply_options = partial(_with_options, port=port, mqtt=mqtt)
     loaded = [(apply_options(settings), model) for settings, model in map(load_pack, paths)]
-    with startup_signals():
+    with exit_on_startup_signals():
         if len(loaded) == 1:
             _run_one(*loaded[0], record, view=_stdout_is_terminal() if view is None else view)
         else:
@@ -67,7 +67,6 @@ def _stdout_is_terminal() -> bool:
 
 
 def _with_options(settings: Settings, port: str | None, mqtt: str | None) -> Settings:
-    """Return the settings with the command line's options."""
     if mqtt:
         settings = with_broker(settings, mqtt)
     return with_sensor(settings, port=port)

@@ -19,7 +19,7 @@ from bms_estimator.process.signals import stop_on_signal
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.setup.broker_login import BrokerLogin
-from bms_estimator.simulation.bms_answers import BMS_ANSWERS
+from bms_estimator.simulation.bms_responses import BMS_RESPONSES
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
@@ -27,7 +27,7 @@ from bms_estimator.simulation.simulated_pack import LOADS, LoadName, PackWithRel
 from bms_estimator.simulation.simulated_stack import SimulatedStack
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
-DEVICE_PROTOCOLS = (*METERS, *BMS_ANSWERS)
+DEVICE_PROTOCOLS = (*METERS, *BMS_RESPONSES)
 """Protocols of the simulated devices that are not boards: battery monitors and BMS."""
 DEFAULT_LOAD_C = 3.0
 """Default load current of a board as a multiple of the capacity [1/h], at which the SOC changes visibly."""
@@ -136,10 +136,10 @@ def simulate(
             raise UserError(
                 "--load relay: only a board with binary frames has a relay; omit --mqtt, --protocol and --text"
             )
-        loaded = PackWithRelay(model, load_a, soc=soc)
-        board = VirtualBoard(loaded, rate_hz=rate_hz, speed=speed, noise_lsb=noise_lsb, seed=seed)
-        loaded.is_connected = lambda: board.relay_high
-        _run(board, loaded, seconds)
+        relay_pack = PackWithRelay(model, load_a, soc=soc)
+        board = VirtualBoard(relay_pack, rate_hz=rate_hz, speed=speed, noise_lsb=noise_lsb, seed=seed)
+        relay_pack.is_connected = lambda: board.relay_high
+        _run(board, relay_pack, seconds)
         return
     pack = SimulatedPack(model, LOADS[load](load_a, seed), soc=soc)
     if mqtt is not None:
@@ -165,7 +165,7 @@ def simulate(
         device = VirtualBoard(pack, rate_hz=rate_hz, mode=mode, speed=speed, noise_lsb=noise_lsb, seed=seed)
     elif protocol in METERS:
         device = METERS[protocol](pack, speed)
-    elif protocol in BMS_ANSWERS:
+    elif protocol in BMS_RESPONSES:
         device = _simulated_bms(protocol, pack, model.cell, speed, seed)
     else:
         raise UserError(

@@ -22,7 +22,7 @@ from bms_estimator.sources.captures.replay import Capture, open_capture, read_sa
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 DISPLAY_NAME = "stdin"
-"""Name used in messages."""
+"""Name of standard input in messages."""
 
 
 @contextmanager
@@ -98,7 +98,7 @@ def read_with_bar(file: Path, capture: Capture) -> SampleBlock:
 
 @contextmanager
 def long_file_bar(label: str, file: Path) -> Iterator[Progress]:
-    """Yield the function that draws the fraction of a file on a bar; for a file that is not long, nothing is drawn."""
+    """Yield a function that draws the finished fraction of a file on a bar. For a short file it draws nothing."""
     if not file.exists() or file.stat().st_size < LONG_FILE_BYTES:
         yield no_progress
         return

@@ -103,7 +103,7 @@ MappedColumns = Annotated[
 
 
 def check_output_file(out: Path, inputs: Sequence[Path], *, force: bool, option: str = "--out") -> None:
-    """Reject an output file that exists, unless ``force`` is set, that is also an input, or whose folder does not exist.
+    """Reject an output file that is also an input, whose folder does not exist, or that exists without ``force``.
 
     Args:
         out: The output file.

@@ -17,8 +17,9 @@ from bms_estimator.settings.sensor import SensorSettings
 LABORATORY_RESOLUTION_V = 1e-3
 """Voltage resolution of laboratory equipment [V], assumed for a capture without a pack file."""
 PLATEAU_CELL, PLATEAU_GAIN_STD = "lfp", 0.01
-"""Generic cell with a plateau, and std of the voltage's gain assumed for its captures. 0.5 % is 16 mV, the step between the two
-plateaus. On three parts of a capture 1.6 % above the curve, 0.01 gave an SOC error of 2.9 to 6.2 %, and 0.005 2.6 to 7.4 %."""
+"""Generic cell with plateaus, and std of the voltage's gain assumed for its captures. ``BMS_GAIN_STD`` is an error
+of 16 mV, the step between the plateaus. On three parts of a capture 1.6 % above the OCV curve, 0.01 gave SOC errors of 2.9 to
+6.2 %, and 0.005 gave 2.6 to 7.4 %."""
 
 
 def load_pack(path: Path) -> tuple[Settings, PackModel]:
@@ -30,7 +31,7 @@ def load_pack(path: Path) -> tuple[Settings, PackModel]:
         UserError: The file cannot be read, a setting is invalid, or the cell is unknown.
     """
     settings = load_settings(path)
-    return settings, _model(settings, _locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
+    return settings, _pack_model(settings, _locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
 
 
 def single_cell_of(path: Path, settings: Settings) -> CellModel:
@@ -58,14 +59,15 @@ def pack_or_cell(
         cell = _locate_cell(pack, settings.pack.cell)
     if capacity_ah is None:
         capacity_ah = settings.pack.capacity_ah
-    model = _model(settings, str(cell), capacity_ah)
+    model = _pack_model(settings, str(cell), capacity_ah)
     return with_pack(settings, cell=cell, capacity_ah=capacity_ah), model
 
 
 def _unknown_sensor(cell: str) -> SensorSettings:
     """Return the sensor of a capture without a pack file.
 
-    A cell file may have been measured with the sensor of the capture. The gain relative to a generic cell is that of any sensor.
+    With a cell file, its gain error is that of a calibrated board, because the file may have been measured with the same sensor.
+    With a generic cell, it is that of any BMS.
     """
     generic_std = PLATEAU_GAIN_STD if cell == PLATEAU_CELL else BMS_GAIN_STD
     gain_std = generic_std if cell in generic_cells() else BOARD_GAIN_STD
@@ -78,7 +80,7 @@ def _locate_cell(pack: Path, cell: str) -> str:
     return str(cell_file) if cell_file.is_file() else cell
 
 
-def _model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
+def _pack_model(settings: Settings, cell: str, capacity_ah: float | None) -> PackModel:
     """Return the model of the whole pack, built from ``cell``."""
     model = load_model(cell, capacity_ah).pack(settings.pack.series, settings.pack.parallel)
     if settings.pack.initial_soc is not None:

@@ -12,7 +12,7 @@ def complete_port(incomplete: str) -> list[str]:
     return [name for name in named_ports() if name.startswith(incomplete)]
 
 
-OtherPort = Annotated[
+PortOverride = Annotated[
     str | None,
     typer.Option(help="serial port that replaces sensor.port of the settings", autocompletion=complete_port),
 ]

@@ -27,7 +27,7 @@ def show_status(text: str) -> AbstractContextManager[object]:
     return console.status(text) if console.is_terminal else nullcontext()
 
 
-def counted(count: int, noun: str, plural: str | None = None) -> str:
+def count_text(count: int, noun: str, plural: str | None = None) -> str:
     """Return a number with a noun in singular or plural; ``plural`` is the noun with an s by default."""
     return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 

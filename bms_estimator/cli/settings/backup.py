@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.installation import places
+from bms_estimator.installation import paths
 from bms_estimator.installation.pack_files import named_files
 from bms_estimator.model.config_file import parse_toml
 from bms_estimator.model.errors import UserError
@@ -28,7 +28,7 @@ Archive = Annotated[Path, typer.Argument(metavar="FILE", help="archive, .tar.gz"
 
 
 def backup(pack: Pack, file: Archive) -> None:
-    """Write the settings of a pack, their passwords, and everything learned to one archive. Stop its service first.
+    """Write the settings of a pack, its passwords and its learned state to one archive. Stop its service first.
 
     `restore` reads the archive on another machine.
     """
@@ -77,7 +77,7 @@ def restore(file: Archive, pack: Pack) -> None:
         with _user_errors(folder):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             for name, data in saved.items():
-                if not _pattern(settings.pack.name).fullmatch(name):
+                if not _state_file_pattern(settings.pack.name).fullmatch(name):
                     raise UserError(f"{file}: {name}: is not a file of the pack {settings.pack.name}")
                 write_private(folder / name, data)
             if not pack.exists():
@@ -94,18 +94,18 @@ def _state_files(pack: Path, settings: Settings) -> Iterator[tuple[Path, list[Pa
     Raises:
         UserError: The service of the pack runs, or the folder cannot be read.
     """
-    is_installed = pack.resolve().parent == places.SETTINGS and settings.state.folder is None
-    folder = (places.STATE if is_installed else state_folder_path(settings)).expanduser()
+    is_installed = pack.resolve().parent == paths.SETTINGS and settings.state.folder is None
+    folder = (paths.STATE if is_installed else state_folder_path(settings)).expanduser()
     with _user_errors(folder), instance_lock(folder, settings.pack.name):
         found = folder.iterdir() if folder.is_dir() else iter(())
-        pattern = _pattern(settings.pack.name)
+        pattern = _state_file_pattern(settings.pack.name)
         yield folder, sorted(each for each in found if each.is_file() and pattern.fullmatch(each.name))
 
 
-def _pattern(name: str) -> re.Pattern[str]:
+def _state_file_pattern(name: str) -> re.Pattern[str]:
     """Return the pattern of the names of the files of a pack's state.
 
-    Another pack may have a name like this one's with an identity, but its files have other suffixes.
+    Another pack may be named ``NAME-0123abcd``, like a checkpoint of this pack. Its files have other suffixes.
     """
     return re.compile(rf"{re.escape(name)}(\.[a-z0-9.-]+|-[0-9a-f]{{8}}\.(((history|load)\.)?npz|changes-\d))")
 

@@ -53,7 +53,7 @@ def show(
     shown["observer"].setdefault("rearm_gain", "never")  # TOML has no null
     typer.echo(tomlkit.dumps(shown))
     typer.echo("# Derived values:")
-    for name, value in derived(settings, cell).items():
+    for name, value in derived_values(settings, cell).items():
         typer.echo(f"# {name} = {value:.6g}")
 
 
@@ -71,7 +71,7 @@ def _derived_of_battery(settings: Settings, cell: CellModel) -> dict[str, float]
     }
 
 
-def derived(settings: Settings, cell: PackModel) -> dict[str, float]:
+def derived_values(settings: Settings, cell: PackModel) -> dict[str, float]:
     """Return values of pack, observer and alarms that follow from the settings and the cell, by dotted name."""
     records = estimator_settings(
         cell,

@@ -20,7 +20,7 @@ from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.doctor.device_check import load_decoder
 from bms_estimator.doctor.examine import examine
-from bms_estimator.doctor.finding import Finding, Level, Subject, fault
+from bms_estimator.doctor.finding import ExaminedPack, Finding, Level, fault
 from bms_estimator.doctor.systemd_unit import unit_of
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.errors import UserError
@@ -79,7 +79,7 @@ def _examine(path: Path) -> Iterator[Finding]:
         yield from examine(subject)
 
 
-def load_examined_settings(path: Path) -> Subject | Finding:
+def load_examined_settings(path: Path) -> ExaminedPack | Finding:
     """Return the pack and its service, or a finding if the settings cannot be used."""
     try:
         settings, model = load_pack(path)
@@ -89,7 +89,7 @@ def load_examined_settings(path: Path) -> Subject | Finding:
         unit = unit_of(path)
     except (OSError, subprocess.TimeoutExpired):  # systemd does not answer: examine the pack without its unit
         unit = None
-    return Subject(path, settings, model, unit)
+    return ExaminedPack(path, settings, model, unit)
 
 
 def _remedy(path: Path) -> str:

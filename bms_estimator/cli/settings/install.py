@@ -9,8 +9,15 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.installation import places
-from bms_estimator.installation.install import PackFiles, compile_ahead, install, restart_running, start, uninstall
+from bms_estimator.installation import paths
+from bms_estimator.installation.install import (
+    PackFiles,
+    compile_ahead,
+    install,
+    restart_running_units,
+    start_service,
+    uninstall,
+)
 from bms_estimator.installation.machine import Machine
 from bms_estimator.installation.pack_files import is_hidden, named_files
 from bms_estimator.installation.program_copy import copy_program, is_program_copy, system_python
@@ -53,24 +60,24 @@ def install_command(
     if machine.has_running_systemd and not no_start:
         if may_start:
             compile_ahead(program)
-            start()
+            start_service()
             _report("service", "started")
         else:
-            restart_running()
-    settings = machine.path(places.PACK_FILE)
+            restart_running_units()
+    settings = machine.path(paths.PACK_FILE)
     if not settings.exists():
         typer.echo("\nThe service starts when it has settings:")
-        _show_next((f"sudo {places.NAME} install PACK.toml", "install the settings of a pack"))
+        _show_next((f"sudo {paths.NAME} install PACK.toml", "install the settings of a pack"))
         return
     page = load_settings(settings).page
     typer.echo("\nNext:")
     _show_next(
-        (f"systemctl status {places.NAME}", "show the state of charge, or why no samples arrive"),
-        (f"journalctl -u {places.NAME} -f", "show the log"),
+        (f"systemctl status {paths.NAME}", "show the state of charge, or why no samples arrive"),
+        (f"journalctl -u {paths.NAME} -f", "show the log"),
         *([(f"http://{page.listen}", "live page")] if page else []),
-        (f"sudoedit {places.PACK_FILE}", "change the settings"),
-        (f"sudo systemctl restart {places.NAME}", "use the changed settings"),
-        (f"sudo {places.NAME} uninstall", "remove the service; settings and state remain"),
+        (f"sudoedit {paths.PACK_FILE}", "change the settings"),
+        (f"sudo systemctl restart {paths.NAME}", "use the changed settings"),
+        (f"sudo {paths.NAME} uninstall", "remove the service; settings and state remain"),
     )
 
 
@@ -80,12 +87,12 @@ def uninstall_command(
 ) -> None:
     """Stop and remove the service, its user, systemd units and udev rule. Settings and state remain. Requires root."""
     machine = _machine(root, "uninstall", ["--purge"] if purge else [])
-    program, has_settings = _own_path(), machine.path(places.PACK_FILE).exists()
+    program, has_settings = _own_path(), machine.path(paths.PACK_FILE).exists()
     with _errors_of_files():
         remaining = uninstall(machine, purge=purge, report=_report)
     home = Path(f"~{os.environ.get('SUDO_USER', 'root')}").expanduser()
-    of_user = (home / name for name in USER_FOLDERS)
-    remaining += [path for path in of_user if machine.path(path).exists()]
+    user_folders = (home / name for name in USER_FOLDERS)
+    remaining += [path for path in user_folders if machine.path(path).exists()]
     if program.exists():
         remaining.append(program)
     if has_settings:
@@ -140,7 +147,7 @@ def _program(machine: Machine) -> Path:
     """
     program = _own_path()
     if not is_hidden(program):
-        if program.is_relative_to(places.PROGRAM_COPY) and is_program_copy(machine.path(places.PROGRAM_COPY)):
+        if program.is_relative_to(paths.PROGRAM_COPY) and is_program_copy(machine.path(paths.PROGRAM_COPY)):
             typer.echo(
                 f"{program} is a copy of version {__version__}, which does not upgrade itself; "
                 "to install another version, run `install` of the program in the home folder",
@@ -148,15 +155,14 @@ def _program(machine: Machine) -> Path:
             )
         return program
     python = system_python()
-    target = machine.path(places.PROGRAM_COPY)
+    target = machine.path(paths.PROGRAM_COPY)
     typer.echo(f"copying the program to {target}, because services cannot read {program.parent}", err=True)
-    copy_program(target, installed_as=places.PROGRAM_COPY, python=python)
-    _report("program", f"{places.PROGRAM_COPY}, version {__version__}")
-    return places.PROGRAM_COPY / "bin" / places.NAME
+    copy_program(target, installed_as=paths.PROGRAM_COPY, python=python)
+    _report("program", f"{paths.PROGRAM_COPY}, version {__version__}")
+    return paths.PROGRAM_COPY / "bin" / paths.NAME
 
 
 def _own_path() -> Path:
-    """Return the absolute path of this program."""
     return Path(sys.argv[0]).resolve()
 
 
@@ -165,7 +171,6 @@ def _report(subject: str, text: str) -> None:
 
 
 def _show_next(*lines: tuple[str, str]) -> None:
-    """Print commands, each with its effect."""
     width = max(len(command) for command, _ in lines)
     for command, text in lines:
         typer.echo(f"  {command:<{width}}  {text}")

@@ -196,23 +196,27 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
             return Answers(chosen, found_broker=result.broker)
-        later = _log_in(prompts, _search([chosen], result.devices))
-        result = replace(later, broker=later.broker or result.broker)
+        new_result = _log_in(prompts, _search([chosen], result.devices))
+        result = replace(new_result, broker=new_result.broker or result.broker)
 
 
 def _log_in(prompts: Prompts, result: SearchResult) -> SearchResult:
-    """Ask for user name and password of each broker that requires them, and search it again until they are right or empty."""
-    while result.closed and prompts.is_interactive:
-        login, *others = result.closed
+    """Ask for the login of each broker that requires one, and search the broker again, until the login is right or empty."""
+    while result.login_required and prompts.is_interactive:
+        login, *others = result.login_required
         username = str(
             typer.prompt(f"User name at {login.url} (empty: skip this broker)", default="", show_default=False)
         )
         if not username:
-            result = replace(result, closed=others)
+            result = replace(result, login_required=others)
             continue
         password = str(typer.prompt("Password", hide_input=True))
-        later = _search([BrokerLogin(login.url, username, password).address], result.devices)
-        result = replace(later, broker=later.broker or result.broker, closed=later.closed + others)
+        new_result = _search([BrokerLogin(login.url, username, password).address], result.devices)
+        result = replace(
+            new_result,
+            broker=new_result.broker or result.broker,
+            login_required=new_result.login_required + others,
+        )
     return result
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO, TypeVar
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.child_process import ends_with_us
+from bms_estimator.process.child_process import terminate_with_parent
 
 LOOPBACK = "127.0.0.1"
 """Address on which all processes listen."""
@@ -133,7 +133,7 @@ async def _start_process(
         stdout=stdout,
         stderr=stderr,
         start_new_session=True,
-        preexec_fn=ends_with_us(),
+        preexec_fn=terminate_with_parent(),
     )
 
 

@@ -32,7 +32,7 @@ from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.model.errors import TemporaryError
-from bms_estimator.process.child_process import end_with
+from bms_estimator.process.child_process import request_sigterm_on_exit_of
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 
@@ -179,7 +179,7 @@ class Fitter:
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(
-                self._options.processes, context, initializer=end_with, initargs=(os.getpid(),)
+                self._options.processes, context, initializer=request_sigterm_on_exit_of, initargs=(os.getpid(),)
             )
         try:
             return await asyncio.get_running_loop().run_in_executor(self._pool, run_job, job)

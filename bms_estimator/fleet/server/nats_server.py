@@ -28,7 +28,7 @@ from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check
 from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.child_process import ends_with_us, find_server
+from bms_estimator.process.child_process import find_server, terminate_with_parent
 from bms_estimator.process.tasks import end
 from bms_estimator.settings.fleet import FleetSettings
 
@@ -181,7 +181,7 @@ async def _running(binary: Path, file: Path) -> AsyncIterator[tuple[asyncio.subp
     for old_file in file.parent.glob("*.ports"):  # left by a killed server
         old_file.unlink()
     process = await asyncio.create_subprocess_exec(
-        binary, "-c", file, "--ports_file_dir", file.parent, preexec_fn=ends_with_us()
+        binary, "-c", file, "--ports_file_dir", file.parent, preexec_fn=terminate_with_parent()
     )
     end_requested, loop = asyncio.Event(), asyncio.get_running_loop()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from bms_estimator.fleet.server.disk_space import GB, USABLE_FRACTION, check_disk_space
 from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.systemd import credential
+from bms_estimator.process.systemd import credential_path
 from bms_estimator.settings.fleet import FleetSettings, TlsSettings, client_address
 
 MAX_REPLICAS = 3
@@ -88,9 +88,9 @@ def _disk_bytes(location: NodeLocation, disk_gb: float | None) -> int | None:
 
 def _tls(settings: TlsSettings) -> Tls:
     return Tls(
-        credential(settings.cert_file).absolute(),
-        credential(settings.key_file).absolute(),
-        credential(settings.ca_file).absolute() if settings.ca_file else None,
+        credential_path(settings.cert_file).absolute(),
+        credential_path(settings.key_file).absolute(),
+        credential_path(settings.ca_file).absolute() if settings.ca_file else None,
     )
 
 

@@ -28,7 +28,7 @@ class BleSource(BaseSource):
     poll_s: Annotated[float, Field(ge=0.5, le=600)] = Field(default=2.0, description="interval between two readings")
 
     @model_validator(mode="after")
-    def _address_or_name(self) -> Self:
+    def _check_address_or_name(self) -> Self:
         if (self.address is None) == (self.name is None):
             raise ValueError("give either address or name")
         return self

@@ -119,7 +119,7 @@ class CanSource(BaseSource):
     )
     soc: Signal | None = Field(
         default=None,
-        description="signal of the SOC by the BMS [%], written like voltage; it is shown beside the estimate",
+        description="signal of the SOC that the BMS reports [%], written like voltage; it is shown beside the estimate",
     )
     cells: tuple[CellSignals, ...] = Field(
         default=(),
@@ -129,7 +129,7 @@ class CanSource(BaseSource):
     @model_validator(mode="before")
     @classmethod
     def _merge_profile(cls, table: object) -> object:
-        if isinstance(table, dict) and "dbc" in table:  # the profile's DBC file, which may be replaced, has its SOC
+        if isinstance(table, dict) and "dbc" in table:  # a configured DBC file need not have the profile's SOC signal
             return merge_profile(table, {name: {**each, "soc": None} for name, each in PROFILES.items()})
         return merge_profile(table, PROFILES)
 

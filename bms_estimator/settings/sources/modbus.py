@@ -127,7 +127,7 @@ class ModbusSource(BaseSource):
     )
     soc: Register | None = Field(
         default=None,
-        description="register of the SOC by the device [%], written like voltage; it is shown beside the estimate",
+        description="register of the SOC that the device reports [%], written like voltage; it is shown beside the estimate",
     )
     capacity: Register | None = Field(
         default=None,

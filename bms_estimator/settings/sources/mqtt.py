@@ -35,8 +35,8 @@ CONVERSIONS: Mapping[Unit, tuple[float, float]] = {
 STALE_PERIODS, MIN_STALE_S = 3.0, 30.0
 """Default age at which a voltage or current is stale: in sample periods, and its minimum [s]."""
 ABSENT_PERIODS = 2.0
-"""Default age at which a temperature or cell voltage that was in each message and is no longer is stale, in sample periods. One
-message without it is tolerated."""
+"""Default age, in sample periods, at which a temperature or cell voltage is stale if every message contained it before, but
+later messages do not. One message without it is tolerated."""
 DEFAULT_RESOLUTION_V = 0.01
 """Voltage resolution of a publisher without a profile [V]."""
 
@@ -126,7 +126,7 @@ class MqttSource(BaseSource):
     )
     soc: ValueLocation | None = Field(
         default=None,
-        description="location of the SOC by the publisher [%], written like voltage; it is shown beside the estimate",
+        description="location of the SOC that the publisher reports [%], written like voltage; it is shown beside the estimate",
     )
     capacity: ValueLocation | None = Field(
         default=None,
@@ -134,15 +134,15 @@ class MqttSource(BaseSource):
     )
     settle_s: Annotated[float, Field(ge=0, le=60)] = Field(
         default=0.5,
-        description="time for which a new voltage and a new current wait for each other. After it the last value of the other is used and marked as held; the estimator interpolates the current at the time of the voltage",
+        description="maximum time between a new voltage and a new current of one sample. After this time the last value of the missing one is used and marked as held; the estimator interpolates the current at the time of the voltage",
     )
     max_age_s: Positive | None = Field(
         default=None,
-        description="maximum age of a voltage or current in a sample; default: three times interval_s, and at least 30 s; one interval_s longer than max_silent_s if that is set. Also maximum age of a temperature or cell voltage that was in each message and is then null or absent; default: twice interval_s",
+        description="maximum age of a voltage or current in a sample; default: three times interval_s, and at least 30 s; one interval_s longer than max_silent_s if that is set. Also maximum age of a temperature or cell voltage that every message contained before, but that is now null or absent; default: twice interval_s",
     )
     max_silent_s: Positive | None = Field(
         default=None,
-        description="longest time between two messages of a publisher that sends only changes; meanwhile the last values are used again, and retained values count while availability_topic reports the publisher online; default: the publisher sends a value in each interval_s",
+        description="maximum time between two messages of a publisher that sends only changes. Until then the last values are used again, and retained values are accepted while availability_topic reports the publisher online; default: the publisher sends a value in each interval_s",
     )
     slow_max_age_s: Positive = Field(
         default=300.0, description="maximum age of a temperature or cell voltage in a sample"
@@ -152,7 +152,7 @@ class MqttSource(BaseSource):
     )
     availability_topic: str | None = Field(
         default=None,
-        description="topic on which the publisher, or its last will, reports offline; the service only names this as the reason when samples are missing",
+        description="topic on which the publisher reports offline, directly or by its last will; the service gives this as the reason for missing samples",
     )
     ask: Mapping[str, str] = Field(
         default={}, description="requests to a publisher that only answers requests, as a table of payloads by topic"
@@ -250,7 +250,7 @@ class MqttSource(BaseSource):
 
     @property
     def absent_s(self) -> float:
-        """Maximum age of a temperature or cell voltage that was in each message and is no longer [s]."""
+        """Maximum age of a temperature or cell voltage that every message contained before, but later messages do not [s]."""
         return self.max_age_s or ABSENT_PERIODS * self.interval_s
 
     @property

@@ -33,7 +33,7 @@ class Profile(NamedTuple):
     voltage_resolution_v: float
     current_resolution_a: float
     protocol: str = ""
-    """Serial protocol of the same BMS, from which the profile has its dead band of the current; empty: no dead band is known."""
+    """Serial protocol of the same BMS, which defines the dead band of the current; empty: no dead band is known."""
     required_settings: Mapping[str, str] = {}
     """Descriptions of the settings without which the profile is incomplete, by name."""
 

@@ -45,7 +45,9 @@ class SetupSession:
     Attributes:
         step: Step that the page shows.
         error: Reason why the last step failed; empty without a failure.
+        places: Places to search.
         result: Result of the last search.
+        answers: Answers so far; None before a device is chosen.
         measured: Values of the chosen device.
         comparisons: Results of the comparisons with the multimeter, as text.
         invalid: Reasons why answers were rejected, by name of the question.
@@ -69,7 +71,7 @@ class SetupSession:
     _task: asyncio.Task[None] | None = field(default=None, init=False)
 
     def start_search(self, places: Sequence[str]) -> None:
-        """Search the places in the background. An earlier search or the estimator ends."""
+        """Search the places in the background. An earlier search, or the estimator, is cancelled."""
         if self._task is not None:
             self._task.cancel()
         self.places, self.step, self.error = places, Step.SEARCHING, ""

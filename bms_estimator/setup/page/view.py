@@ -87,7 +87,7 @@ def _device(session: SetupSession, form_key: str) -> str:
     )
     form = _form("device", form_key, devices, "Use this device") if devices else "<p>No device was found.</p>"
     failures = f'<ul class="note">{_items(session.result.failures)}</ul>' if session.result.failures else ""
-    logins = "".join(_login(login, form_key) for login in session.result.closed)
+    logins = "".join(_login(login, form_key) for login in session.result.login_required)
     return f'<section class="card"><h2>Found</h2>{form}{failures}</section>{logins}{_search(session, form_key)}'
 
 
@@ -160,7 +160,7 @@ _BODIES = {
 
 
 def _question(session: SetupSession, question: Question) -> str:
-    """Return the field of a question, with the default or the rejected answer in it."""
+    """Return the field of a question. It contains the entered text, otherwise the default."""
     default = question.suggest(session.answers) if session.answers else ""
     entered = session.texts.get(question.name, default)
     reason = session.invalid.get(question.name)

@@ -25,7 +25,7 @@ from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 from bms_estimator.process.daemon_thread import DaemonThreadExecutor
-from bms_estimator.process.systemd import credential
+from bms_estimator.process.systemd import credential_path
 from bms_estimator.process.tasks import FIRST_DELAY_S, Backoff, finish
 from bms_estimator.settings.exports import InfluxSettings
 
@@ -272,7 +272,7 @@ def _secret(key: str, path: Path) -> str:
         TemporaryError: The file cannot be read, or is not one line of text.
     """
     try:
-        secret = credential(path).read_text(encoding="utf-8").strip()
+        secret = credential_path(path).read_text(encoding="utf-8").strip()
     except OSError as error:
         raise TemporaryError(f"influx.{key} = {path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:  # its text would show bytes of the secret

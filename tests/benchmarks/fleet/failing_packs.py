@@ -92,7 +92,7 @@ def rows_of_pack(chemistry: str, variant: str, days: int = DAYS, seed: int = 0) 
     """
     c, v, name = CHEMISTRIES[chemistry], VARIANTS[variant], f"{chemistry}-{variant}"
     rng, cell = np.random.default_rng([seed, *name.encode()]), load_cell(chemistry, CAPACITY_AH)
-    drawn = BankCells.drawn(rng, c.series, CAPACITY_AH, 0.9).with_weak_cell(
+    drawn = BankCells.random(rng, c.series, CAPACITY_AH, 0.9).with_weak_cell(
         FAULTY_CELL - 1, capacity_ratio=v.capacity_ratio, soc_below=v.soc_below
     )
     drawn.warmer_k[:] = np.linspace(0.0, WARMER_K, c.series)

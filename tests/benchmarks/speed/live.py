@@ -98,8 +98,8 @@ class TimedBoard(VirtualBoard):
         super().__init__(readings, rate_hz=rate_hz)
         self.sent_s: list[float] = []
 
-    def _frame(self, message: SampleMessage) -> bytes:
-        frame = super()._frame(message)
+    def _frame_with_fault(self, message: SampleMessage) -> bytes:
+        frame = super()._frame_with_fault(message)
         self.sent_s.append(time.monotonic())
         return frame
 

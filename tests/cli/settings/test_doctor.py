@@ -45,7 +45,7 @@ def _empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def pack(tmp_path: Path, broker: Broker, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a settings file whose source is silent."""
-    monkeypatch.setattr("bms_estimator.doctor.device_check.FIRST_SAMPLE_S", 1.0)
+    monkeypatch.setattr("bms_estimator.doctor.device_check.FIRST_SAMPLE_TIMEOUT_S", 1.0)
     file = tmp_path / "pack.toml"
     file.write_text(PACK.format(url=broker.url, folder=tmp_path / "state"))
     return file

@@ -55,7 +55,7 @@ def long_timeouts(monkeypatch):
     """Lengthen the timeouts for a JK-BMS. Shorten the wait for a board, because none is connected."""
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.BOOT_TIMEOUT_S", 0.1)
     monkeypatch.setattr("bms_estimator.sources.serial.device_detection.PROTOCOL_TIMEOUT_S", LONG_S)
-    monkeypatch.setattr("bms_estimator.setup.measurement.FIRST_SAMPLE_S", LONG_S)
+    monkeypatch.setattr("bms_estimator.setup.measurement.FIRST_SAMPLE_TIMEOUT_S", LONG_S)
     monkeypatch.setattr("bms_estimator.setup.measurement.AVERAGE_S", 0.1)
 
 
@@ -315,7 +315,7 @@ def check_settings_with_login(file: Path, broker: Broker) -> None:
 def test_a_publisher_at_a_broker_with_a_password_is_found_with_its_values(
     node_broker, file, capsys, long_timeouts, monkeypatch
 ):
-    monkeypatch.setattr("bms_estimator.setup.search.LISTEN_S", 2.0)
+    monkeypatch.setattr("bms_estimator.setup.search.LISTEN_DURATION_S", 2.0)
     place = node_broker.url.replace("://", f"://owner:{quote(PASSWORD, safe='')}@")
     answers = options(series=None, parallel=None, broker=None)
     code, out, err = run(capsys, "new", file, "--search", place, *answers, "--yes", "--no-estimate")

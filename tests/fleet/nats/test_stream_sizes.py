@@ -78,7 +78,7 @@ async def test_stored_day_of_a_pack_is_at_most_as_large_as_computed(tmp_path: Pa
 @pytest.mark.parametrize("cells", [4, 16, 66, 100])
 def test_block_hour_and_state_with_cell_voltages_are_at_most_as_large_as_computed(cells: int) -> None:
     rng, cell = np.random.default_rng(1), load_cell("nmc", 50.0)
-    bank, model = SimulatedBank(cell, BankCells.drawn(rng, cells, 50.0, 0.8)), cell.pack(cells, 1)
+    bank, model = SimulatedBank(cell, BankCells.random(rng, cells, 50.0, 0.8)), cell.pack(cells, 1)
     settings, store_ns = Settings(), 490_000 * 3600 * 10**9
     partition, sizes, hours, additional = Partition(0, lambda _: (settings, model)), [], [], []
     for number in range(1, 62):

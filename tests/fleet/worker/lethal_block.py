@@ -7,7 +7,7 @@ import sys
 from bms_estimator.cli.fleet.worker import worker  # noqa: F401 - imported before the fork, so that a restart is quick
 from bms_estimator.cli.main import main
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
-from bms_estimator.process.child_process import ends_with_us
+from bms_estimator.process.child_process import terminate_with_parent
 
 TEMPERATURE_C = 66.6
 """Temperature of the samples of a lethal block."""
@@ -23,7 +23,7 @@ def step_or_die(self: BlockProcessor, pack, block, *args):
 
 def run_until_it_survives() -> None:
     """Run the worker in child processes, until one of them ends by itself."""
-    prepare_child = ends_with_us()
+    prepare_child = terminate_with_parent()
     while True:
         child = os.fork()
         if child == 0:

@@ -42,7 +42,7 @@ def table(_pack):
 def minutes(seed, count=MINUTES):
     """Return a block of each minute of a simulated pack with a weak cell."""
     rng = np.random.default_rng(seed)
-    drawn = BankCells.drawn(rng, CELLS, CAPACITY_AH, 0.8).with_weak_cell(WEAK, soc_below=0.1)
+    drawn = BankCells.random(rng, CELLS, CAPACITY_AH, 0.8).with_weak_cell(WEAK, soc_below=0.1)
     bank, blocks = SimulatedBank(CELL, drawn), []
     for number in range(1, count + 1):
         history = bank.run(CAPACITY_AH * 0.2 * (1.0 + 0.5 * np.sin(np.arange(60.0) / 7.0)))

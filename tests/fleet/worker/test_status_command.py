@@ -95,7 +95,7 @@ async def test_wrong_clock_of_the_server_is_named_instead_of_all_edges(cluster, 
 
 
 async def test_one_node_of_three_is_the_reason_why_streams_cannot_be_read(tmp_path, capsys, monkeypatch) -> None:
-    monkeypatch.setattr(status_command, "STREAMS_S", 2.0)
+    monkeypatch.setattr(status_command, "STREAMS_TIMEOUT_S", 2.0)
     heartbeat = Heartbeat(id="w", started_s=1.79e9)
     with running(tmp_path, 3, partitions=2) as cluster:
         async with await nats.connect(cluster.url) as nc:

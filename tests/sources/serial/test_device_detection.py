@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.protocols.devices import daly, jbd, jk, junctek
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol
-from bms_estimator.simulation.bms_answers import BMS_ANSWERS
+from bms_estimator.simulation.bms_responses import BMS_RESPONSES
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS
 from bms_estimator.simulation.virtual_adc import Reading
@@ -32,7 +32,7 @@ def bms(name: str) -> SimulatedBms:
     return SimulatedBms(name, steady, cells=8)
 
 
-@pytest.mark.parametrize("name", [name for name in BMS_ANSWERS if name != "jk-pb"])
+@pytest.mark.parametrize("name", [name for name in BMS_RESPONSES if name != "jk-pb"])
 def test_bms_is_detected_with_its_number_of_cells(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", LONG_S)
     with running_device(bms(name)) as path:

@@ -31,12 +31,12 @@ class Measured:
     capacity_ah: float
 
 
-Answers = Mapping[bytes, Callable[[Measured], bytes]]
+ResponseEncoders = Mapping[bytes, Callable[[Measured], bytes]]
 """Function that encodes the response, by request."""
 
 
 def _to_steps(value: float, per_unit: float, minimum: int, maximum: int) -> int:
-    """Convert a value to integer steps, of which ``per_unit`` are a unit of the value, limited to a range."""
+    """Convert a value to an integer number of steps, limited to a range. ``per_unit`` steps are one unit of the value."""
     return min(max(round(value * per_unit), minimum), maximum)
 
 
@@ -106,7 +106,7 @@ def _jk_old(measured: Measured) -> bytes:
         probe_word = jk.ABSENT_C
     else:
         temperature_c = _to_steps(measured.temperature_c, 1, JK_OLD_MIN_C, JK_OLD_MAX_C)
-        probe_word = temperature_c if temperature_c >= 0 else 100 - temperature_c  # above 100: below zero
+        probe_word = temperature_c if temperature_c >= 0 else 100 - temperature_c  # -5 is sent as 105
     cells = b"".join(struct.pack(">BH", i, _to_u16(v, 1000)) for i, v in enumerate(measured.cells_v, 1))
     registers = (
         bytes((jk.CELLS, len(cells)))
@@ -144,7 +144,7 @@ def _jk_newer(measured: Measured) -> bytes:
     return bytes(frame) + record + jk.crc16(record)
 
 
-BMS_ANSWERS: Mapping[str, Answers] = {
+BMS_RESPONSES: Mapping[str, ResponseEncoders] = {
     "jbd": {
         jbd.request(jbd.NAME): lambda _: _jbd_frame(jbd.NAME, NAME),
         jbd.request(jbd.CELLS): _jbd_cells,
