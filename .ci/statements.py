@@ -1,4 +1,4 @@
-"""Budget of statements: exit with 1 if package or tests have more. Who needs more raises a limit in a commit that says why."""
+"""Budget of statements: exit with 1 if package or tests have more. A commit that raises a limit states the reason."""
 
 import ast
 import sys

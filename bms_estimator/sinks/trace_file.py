@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.errors import UserError
 
 GZIP_LEVEL = 3
-"""Compression level of gzip. It takes a third of the time of level 9 and gives files larger by some percent."""
+"""Compression level of gzip. It takes a third of the time of level 9, and the files are a few percent larger."""
 
 
 class TableSink(Protocol):
@@ -51,11 +51,9 @@ class CsvSink:
         self._file: IO[bytes] | None = None
 
     def __enter__(self) -> Self:
-        """Return the sink; the first block opens the file."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Complete the file."""
         self._files.close()
 
     def write(self, trace: NDArray[np.void]) -> None:
@@ -70,8 +68,8 @@ class CsvSink:
         file = self._files.enter_context(_create(self._path))
         if self._path.suffix.lower() != ".gz":
             return file
-        packed = gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=GZIP_LEVEL)
-        return self._files.enter_context(cast("IO[bytes]", packed))
+        gzip_file = gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=GZIP_LEVEL)
+        return self._files.enter_context(cast("IO[bytes]", gzip_file))
 
 
 class ParquetSink:
@@ -89,11 +87,9 @@ class ParquetSink:
         self._writer: Any = None
 
     def __enter__(self) -> Self:
-        """Return the sink; the first block opens the file."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Complete the file."""
         self._files.close()
 
     def write(self, trace: NDArray[np.void]) -> None:

@@ -1,7 +1,7 @@
 """Packages and compiled kernels for arm64, made on a machine of any architecture.
 
-``python deploy/debian/arm64.py`` compiles the kernels to the folder NUMBA_CACHE_DIR. LLVM generates machine code for arm64, which
-is the same as that compiled on arm64, and is not executed here.
+``python deploy/debian/arm64.py`` compiles the kernels to the folder NUMBA_CACHE_DIR. LLVM generates the same machine code as on
+arm64. The code is not executed here.
 """
 
 import shutil
@@ -32,7 +32,9 @@ def install_packages(requirements: str, site_packages: Path) -> None:
     command += ["--disable-pip-version-check", f"--target={site_packages}", f"--platform=manylinux2014_{MACHINE}"]
     subprocess.run([*command, *platforms, f"--requirement={lock}"], check=True)
     lock.unlink()
-    for library in site_packages.rglob("*-x86_64-linux-gnu.so"):  # compiled here; the package is also written in Python
+    for library in site_packages.rglob(
+        "*-x86_64-linux-gnu.so"
+    ):  # compiled for this machine; the package works without it
         library.unlink()
     programs = site_packages / "bin"
     shutil.copy2(programs / "nats-server", site_packages.parents[2] / "bin")

@@ -1,9 +1,9 @@
 """Build the Debian package of the program: ``make deb``, and ``make deb-arm64`` for arm64 on any machine.
 
 The package has a virtual environment in /usr/lib/bms-estimator with the wheel of this checkout and the packages that it
-requires. They are copied from the environment of this script, which is installed from requirements.lock with its hashes, or
-else installed for arm64 with the same versions and hashes.
-It contains the compiled kernels, for the minor version of Python of this script and the architecture of the package.
+requires. For this machine's architecture they are copied from the environment of this script, which is installed from
+requirements.lock with its hashes. For arm64 they are installed with the same versions and hashes.
+The package contains the compiled kernels for its architecture and for the minor version of Python of this script.
 The maintainer scripts run ``bms-estimator install`` and ``uninstall``.
 """
 
@@ -77,7 +77,7 @@ def build(output: Path, compression: str, architecture: str) -> Path:
     link = root / "usr/bin/bms-estimator"
     link.parent.mkdir()
     link.symlink_to(f"..{ENVIRONMENT.as_posix().removeprefix('/usr')}/bin/bms-estimator")
-    version = program.version.replace(".dev", "~dev")  # Debian orders 0.1.0~dev1 before 0.1.0, but 0.1.0.dev1 behind it
+    version = program.version.replace(".dev", "~dev")  # Debian orders 0.1.0~dev1 before 0.1.0, but 0.1.0.dev1 after it
     write_documents(root / "usr/share/doc/bms-estimator", version)
     write_control(root / "DEBIAN", version, architecture, size_kib(root))
     subprocess.run(["chmod", "-R", "u=rwX,go=rX", root], check=True)

@@ -1,5 +1,5 @@
 // Voltage (A0), current (A1) and temperature (A2) of a battery pack, for an ATmega328P at 16 MHz: Uno, Nano.
-// Timer 1 triggers the converter, its interrupt sums up, this loop sends. PROTOCOL.md tells what.
+// Timer 1 triggers the converter, whose interrupt sums the conversions. The loop sends them as PROTOCOL.md specifies.
 
 #ifndef __AVR_ATmega328P__
 #error "This firmware is for an ATmega328P at 16 MHz: choose Arduino Uno or Nano as the board."
@@ -20,7 +20,7 @@ static bool overrun;
 
 void setup() {
     relay_start();
-    TIMSK0 = 0;  // nobody asks for millis(), and its interrupt would only delay ours
+    TIMSK0 = 0;  // millis() is not used, and its interrupt would delay the others
     reset_start_watchdog();
     settings_load();
     line_start();

@@ -19,11 +19,11 @@
 static boot_readings boot;
 static uint16_t boot_id;
 
-static uint32_t next_sequence, last_us;  // as the samples that have passed here tell
+static uint32_t next_sequence, last_us;  // sequence of the next sample, and time of the last one
 
 static bool hello_wanted;
 static uint8_t ack[ACK_BYTES];
-static uint8_t ack_length;  // 0: none waits
+static uint8_t ack_length;  // 0: no acknowledgment waits
 
 static struct {
     bool measuring, begun, measured;
@@ -35,7 +35,7 @@ static void answer_ack(uint8_t command, uint8_t result, uint32_t value) {
     ack_length = encode_ack(ack, &message);
 }
 
-// Made when there is room, not when it is asked for: its sequence must not lie behind a sample sent meanwhile.
+// Builds the hello only when the line has room: its sequence must not be older than that of a sample sent meanwhile.
 static bool send_hello() {
     hello_message hello = {};
     hello.firmware_major = FIRMWARE_MAJOR;
@@ -110,12 +110,12 @@ void commands_see(const sample_message &sample) {
 
 static void end_zero() {
     zero.measuring = false;
-    // sum / count / 1024 in millionths; 64 bits since a second's sum times a million needs 42
+    // sum / count / 1024 in ppm; 64 bits, because the sum of a second times a million needs 42
     const uint64_t scaled = (uint64_t)zero.sum * 1000000UL / zero.count;
     answer_setting(COMMAND_ZERO_CURRENT, SETTING_CURRENT_ZERO_PPM, (uint32_t)((scaled + (1 << 9)) >> ADC_BITS));
 }
 
-// What a command with one number sets; SETTINGS: nothing.
+// Returns the setting that a command with one number changes; SETTINGS if it changes none.
 static setting setting_of(uint8_t command) {
     switch (command) {
         case COMMAND_SET_SERIAL: return SETTING_SERIAL;

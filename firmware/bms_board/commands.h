@@ -1,4 +1,4 @@
-// What the host asks for.
+// Commands of the host, and the board's responses.
 #ifndef BMS_BOARD_COMMANDS_H
 #define BMS_BOARD_COMMANDS_H
 
@@ -7,10 +7,10 @@
 // Queues the first hello.
 void commands_start(const boot_readings &boot);
 
-// Takes and answers what has come. An answer waits until the line has room, and so do the commands behind it.
+// Handles received commands. A response waits until the line has room, and the later commands wait, too.
 void commands_poll();
 
-// Every sample passes here before it is sent: the hello tells where it stands, a measurement of the zero adds it up.
+// Handles a sample before it is sent. The hello reports its sequence and time, and a measurement of the zero sums it.
 void commands_see(const sample_message &sample);
 
 #endif

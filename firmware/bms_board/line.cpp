@@ -5,7 +5,7 @@
 
 #include "protocol.h"
 
-#define TRANSMIT_ROOM 255  // indices of eight bits wrap by themselves
+#define TRANSMIT_ROOM 255  // 8-bit indices wrap at the ring's size
 #define RECEIVE_ROOM 255
 
 static volatile uint8_t transmit_ring[256], receive_ring[256];
@@ -16,7 +16,7 @@ void line_start() {
     UBRR0 = F_CPU / 8 / PROTOCOL_BAUD - 1;
     UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
     UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
-    UDR0 = 0;  // ends the frame that a reset has cut off, which would spoil the hello
+    UDR0 = 0;  // ends a frame that a reset has cut off, which would make the hello invalid
 }
 
 ISR(USART_UDRE_vect) {
@@ -28,7 +28,7 @@ ISR(USART_UDRE_vect) {
 
 ISR(USART_RX_vect) {
     const uint8_t byte = UDR0, head = receive_head;
-    if ((uint8_t)(head - receive_tail) == RECEIVE_ROOM) return;  // its frame will fail: the host asks again
+    if ((uint8_t)(head - receive_tail) == RECEIVE_ROOM) return;  // its frame becomes invalid, and the host retries
     receive_ring[head] = byte;
     receive_head = head + 1;
 }

@@ -42,8 +42,8 @@ enum sample_status {
 #define CHANNEL_NTC 0x01
 #define CHANNEL_CURRENT_RATIOMETRIC 0x02
 
-// The number of COMMAND_SET_RELAY: bit 0 is the level, the byte above what becomes of it when the host is silent, the
-// upper half after how many seconds.
+// The value of COMMAND_SET_RELAY: bit 0 is the level, the second byte the level after a silence of the host, and the
+// upper half its duration in seconds.
 enum relay_silence { RELAY_KEEP = 0, RELAY_LOW = 1, RELAY_HIGH = 2 };
 #define RELAY_SILENT_MAX_S 3600
 
@@ -56,13 +56,13 @@ enum relay_silence { RELAY_KEEP = 0, RELAY_LOW = 1, RELAY_HIGH = 2 };
 #define HELLO_BYTES 62
 #define ACK_BYTES 10
 #define PACKET_MAX_BYTES 64
-#define FRAME_MAX_BYTES (PACKET_MAX_BYTES + 2)  // COBS adds one byte below 254, the delimiter another
+#define FRAME_MAX_BYTES (PACKET_MAX_BYTES + 2)  // COBS adds one byte to less than 254, and a delimiter follows
 
 typedef struct {
     uint32_t sequence;
     uint32_t board_us;
-    uint32_t voltage_sum;  // 24 bits travel
-    uint32_t current_sum;  // 24 bits travel
+    uint32_t voltage_sum;  // 24 bits on the line
+    uint32_t current_sum;  // 24 bits on the line
     uint16_t count;
     uint16_t aux_sum;
     uint8_t aux_count;
@@ -108,7 +108,7 @@ static inline uint16_t crc16(const uint8_t *data, uint8_t length) {
     return crc;
 }
 
-// Little-endian, whatever the compiler's own order.
+// Writes a little-endian number, whatever the byte order of the CPU.
 static inline uint8_t *put(uint8_t *to, uint32_t value, uint8_t bytes) {
     while (bytes--) {
         *to++ = (uint8_t)value;
@@ -183,7 +183,7 @@ static inline uint8_t encode_ack(uint8_t *packet, const ack_message *m) {
     return seal(packet, to);
 }
 
-// COBS with the delimiter behind it. Returns the length of the frame: length + 2, since packets are short.
+// Encodes by COBS and appends the delimiter. Returns the length of the frame: length + 2 for packets below 254 bytes.
 static inline uint8_t cobs_encode(uint8_t *frame, const uint8_t *packet, uint8_t length) {
     uint8_t *code = frame, *to = frame + 1;
     *code = 1;
@@ -201,7 +201,7 @@ static inline uint8_t cobs_encode(uint8_t *frame, const uint8_t *packet, uint8_t
     return (uint8_t)(to - frame);
 }
 
-// In place, without the delimiter. Returns the length of the packet, 0 when it is not COBS.
+// Decodes COBS in place, without the delimiter. Returns the length of the packet; 0 if it is not COBS.
 static inline uint8_t cobs_decode(uint8_t *buffer, uint8_t length) {
     uint8_t from = 0, to = 0;
     while (from < length) {

@@ -4,13 +4,13 @@
 
 #include "protocol.h"
 
-#define PIN _BV(4)  // D4 is PD4: no timer, no interrupt and no part of the serial line
+#define PIN _BV(4)  // D4 is PD4, which timers, interrupts and the serial line do not use
 #define US_PER_S 1000000UL
 
 static uint32_t number;
 static uint8_t when_silent;
 static uint16_t seconds_left;
-static uint32_t second_us;  // where the second that runs has begun
+static uint32_t second_us;  // begin of the present second of silence
 static bool second_begun;
 
 static void drive(bool high) {

@@ -1,19 +1,19 @@
-// A pin that the host sets, to cut the load or the charger: D4, high or low.
+// The relay pin D4, which the host sets to disconnect the load or the charger.
 #ifndef BMS_BOARD_RELAY_H
 #define BMS_BOARD_RELAY_H
 
 #include <stdint.h>
 
-// Low, as after every reset.
+// Sets the pin low, as after every reset.
 void relay_start();
 
-// Takes the number of the command. Returns false, and changes nothing, when it is none.
+// Applies the value of COMMAND_SET_RELAY. Returns false and changes nothing if the value is not valid.
 bool relay_set(uint32_t number);
 
-// The number that holds; 0 after a reset.
+// Returns the last applied value; 0 after a reset.
 uint32_t relay_get();
 
-// Every sample's time passes here: it tells for how long the host has been silent.
+// Measures the silence of the host by the time of each sample.
 void relay_see(uint32_t board_us);
 
 #endif

@@ -8,15 +8,15 @@
 
 #define CAUSES 0x0F
 
-// Not touched by the start-up code: the RAM keeps them through every reset but a power-on.
+// Variables that the start-up code does not initialize. RAM retains them through every reset except power-on.
 static uint8_t cause __attribute__((section(".noinit")));
 static uint16_t boot_id __attribute__((section(".noinit")));
 static uint16_t boot_id_inverted __attribute__((section(".noinit")));
 
 static bool restarting;
 
-// Before anything else: after a watchdog reset the watchdog goes on with its shortest time.
-// Optiboot clears MCUSR and hands it on in r2, as the restart below does; old ones clear it without handing it on.
+// Runs before the other start-up code, because after a watchdog reset the watchdog stays on with its shortest timeout.
+// Optiboot clears MCUSR and passes it on in r2, as the restart below does. Older boot loaders clear it only.
 extern "C" void save_cause() __attribute__((naked, used, section(".init3")));
 void save_cause() {
     uint8_t by_loader;
@@ -29,7 +29,7 @@ void save_cause() {
 
 uint8_t reset_cause() { return cause & CAUSES; }
 
-// Power-ups are counted in EEPROM, in the upper byte; other resets go on counting in RAM, which does not wear.
+// The upper byte counts power-ups in EEPROM. The other resets are counted in RAM, which does not wear.
 uint16_t reset_count_boot() {
     if (boot_id_inverted == (uint16_t)~boot_id) {
         boot_id++;
@@ -42,20 +42,21 @@ uint16_t reset_count_boot() {
     return boot_id;
 }
 
-// In interrupt and system reset mode the first time-out calls the interrupt below, and only where interrupts have been
-// locked until the second does the watchdog reset the chip.
+// In interrupt and system reset mode, the first timeout calls the interrupt below. The watchdog resets the chip only if
+// interrupts are disabled until the second timeout.
 void reset_start_watchdog() {
     wdt_enable(WDTO_250MS);
     WDTCSR |= _BV(WDIE);
 }
 
-// Starts the sketch anew without a reset of the chip: after that the watchdog would go on with 16 ms, in which the boot
-// loader of Nanos of before 2018 never gets as far as the sketch. save_cause turns the watchdog off, long before its next
-// time-out. As at a reset interrupts are off now; the core turns them on before the sketch has set up its rings and
-// windows, so their sources are put back, and the pull-up of the NTC's pin. All other registers are written whole when
-// they are used. The stack may be what went wrong: nothing is pushed. Software can only clear MCUSR, hence r2.
+// Restarts the sketch without a reset of the chip. After a reset the watchdog would stay on with 16 ms, in which the boot
+// loader of Nanos built before 2018 does not reach the sketch. save_cause turns the watchdog off before its next timeout.
+// As at a reset, interrupts are disabled now. The core enables them before the sketch has set up its ring buffers and
+// windows. Therefore their sources are reset here, and the pull-up of the NTC's pin. All other registers are written
+// completely before they are used. Nothing is pushed, because the stack may be damaged. The cause is passed on in r2,
+// because software can only clear MCUSR.
 ISR(WDT_vect, ISR_NAKED) {
-    asm volatile("clr r1");  // the compiler's zero
+    asm volatile("clr r1");  // the compiler expects 0 in r1
     TIMSK0 = TIMSK1 = TIMSK2 = 0;
     ADCSRA = 0;
     UCSR0B = 0;

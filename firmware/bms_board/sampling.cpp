@@ -20,29 +20,29 @@
 #define BOOT_READINGS 256
 #define NTC_OPEN_READING 1015  // with the pull-up on; an NTC at -40 degC gives 999
 
-// Timer 1 triggers when it counts this: once a slot, however long the slot is. The chip would take 0 as well, simavr
-// needs some instructions from the turn of the counter to it.
+// Count at which timer 1 triggers a conversion, once a slot of any length. The chip would accept 0. simavr needs some
+// instructions between the wrap of the counter and the trigger.
 #define TRIGGER_AT 16
 
-// A conversion ends 1728 cycles after its trigger; before that there is time to fall asleep.
+// Range of the count in which the CPU may go to sleep. A conversion ends 1728 cycles after its trigger.
 #define SLEEP_FROM_CYCLES 64
 #define SLEEP_UNTIL_CYCLES 1500
 
 static sample_message windows[2];
-static uint8_t filling;              // index of the window being summed up; the interrupt's own
-static volatile bool window_waits;   // the other one has ended and is not released
+static uint8_t filling;              // index of the window being summed; only the interrupt changes it
+static volatile bool window_waits;   // true: the other window has ended and is not released
 
 static window_timing timing, next_timing;
 static volatile bool timing_changed;
 
 static uint32_t next_sequence, elapsed_us;
-static uint8_t elapsed_cycles;       // beyond elapsed_us, below 16
+static uint8_t elapsed_cycles;       // remainder of elapsed_us, below 16
 
 static bool ntc_fitted;
 static uint16_t slots_left;
 static uint8_t aux_countdown, aux_mux = MUX_BANDGAP;
 static bool aux_now;
-static uint8_t mux;                  // of the conversion that runs
+static uint8_t mux;                  // input of the running conversion
 
 static void begin_window(sample_message *w, uint8_t status) {
     w->voltage_sum = w->current_sum = 0;
@@ -54,10 +54,10 @@ static void begin_window(sample_message *w, uint8_t status) {
     if (aux_now) aux_countdown = timing.aux_windows;
 }
 
-// The counter may stand anywhere, also beyond the new top. In CTC mode it would go on to 65535 then: "If the new value
-// written to OCR1A is lower than the current value of TCNT1, the counter will miss the compare match" (data sheet,
-// 15.9.2). In fast PWM OCR1A is double buffered and changes where the counter turns (15.9.3): the slot that runs keeps
-// its length, and those of the new window get theirs.
+// The counter may already be beyond the new top. In CTC mode it would then count to 65535: "If the new value written to
+// OCR1A is lower than the current value of TCNT1, the counter will miss the compare match" (data sheet, 15.9.2). In fast
+// PWM, OCR1A is double buffered and changes when the counter wraps (15.9.3). Therefore the running slot keeps its length,
+// and the slots of the new window have the new length.
 static void apply_timing() {
     timing = next_timing;
     timing_changed = false;
@@ -73,7 +73,7 @@ static void end_window(sample_message *w) {
     w->board_us = elapsed_us;
     uint8_t status = 0;
     if (window_waits) {
-        status = STATUS_OVERRUN;  // this one is lost, and its place is used again
+        status = STATUS_OVERRUN;  // this window is lost, and its memory is reused
     } else {
         window_waits = true;
         filling ^= 1;
@@ -96,8 +96,8 @@ static inline void take_aux(sample_message *w, uint16_t reading) {
     if (ntc_fitted) aux_mux = aux_mux == MUX_NTC ? MUX_BANDGAP : MUX_NTC;
 }
 
-// There are 270 cycles from the end of a conversion to the next trigger: by then the input must be switched and the
-// trigger armed. No interrupt and no locked section may last so long.
+// The next trigger comes 270 cycles after the end of a conversion. Before it, the input must be switched and the trigger
+// armed. Every other interrupt, and every section with interrupts disabled, must be shorter than that.
 ISR(ADC_vect) {
     const uint16_t reading = ADC;
     sample_message *w = &windows[filling];
@@ -138,7 +138,7 @@ boot_readings sampling_measure_at_boot() {
     ADCSRA = _BV(ADEN) | PRESCALER_128;
 
     ADMUX = MUX_NTC;
-    PORTC |= _BV(PORTC2);  // an open input floats anywhere: the pull-up makes it an upper end
+    PORTC |= _BV(PORTC2);  // an open input floats; the pull-up sets it to the upper end
     _delay_ms(1);
     convert_now();
     boot.ntc_fitted = convert_now() < NTC_OPEN_READING;
@@ -182,7 +182,7 @@ const window_timing &sampling_timing() { return next_timing; }
 
 sample_message *sampling_window() {
     if (!window_waits) return nullptr;
-    _MemoryBarrier();  // nothing of the window is read before the flag
+    _MemoryBarrier();  // the window must not be read before the flag
     return &windows[filling ^ 1];
 }
 

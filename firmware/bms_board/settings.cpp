@@ -22,9 +22,9 @@ static const allowed ranges[SETTINGS] = {
 };
 
 static uint8_t records[SETTINGS][RECORD_BYTES];
-static uint8_t unwritten = sizeof records;  // index of the next byte to be compared with the EEPROM; the size: none
+static uint8_t unwritten = sizeof records;  // index of the next byte to write; the size: all are written
 
-// The CRC includes which setting it is.
+// Returns the CRC of a setting's index and value.
 static uint16_t check_of(uint8_t which) {
     uint8_t checked[1 + VALUE_BYTES] = {which};
     for (uint8_t i = 0; i < VALUE_BYTES; i++) checked[1 + i] = records[which][i];

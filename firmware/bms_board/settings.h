@@ -1,10 +1,10 @@
-// What the board keeps in EEPROM, each value with a check of its own.
+// Settings in EEPROM, each with its own CRC.
 #ifndef BMS_BOARD_SETTINGS_H
 #define BMS_BOARD_SETTINGS_H
 
 #include <stdint.h>
 
-// In this order in the EEPROM: new ones go to the end, so that boards keep what they have.
+// Settings in the order of the EEPROM. New ones are appended, so that boards keep their stored values.
 enum setting : uint8_t {
     SETTING_SERIAL,
     SETTING_BANDGAP_UV,
@@ -25,15 +25,15 @@ enum setting : uint8_t {
 #define CURRENT_MIN_UV_PER_A 1000UL
 #define CURRENT_MAX_UV_PER_A 2000000UL
 
-// Reads all; a value that was never set, was half written or is out of its range is the default.
+// Reads all settings. A value that was never set, was only partly written or is out of range becomes the default.
 void settings_load();
 
 uint32_t settings_get(setting which);
 
-// Returns false when the value is out of its range. What holds changes at once, the EEPROM follows.
+// Changes a setting at once; settings_write_on stores it later. Returns false if the value is out of range.
 bool settings_set(setting which, uint32_t value);
 
-// Writes one byte if the EEPROM is ready for it: call it often, it never waits.
+// Writes one byte if the EEPROM is ready for it. It never waits; call it in each loop.
 void settings_write_on();
 
 #endif

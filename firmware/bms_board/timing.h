@@ -1,4 +1,4 @@
-// How the converter's clock is divided into samples. Also compiled on the host by the tests.
+// Division of the converter's clock into samples. The tests compile it on the host.
 #ifndef BMS_BOARD_TIMING_H
 #define BMS_BOARD_TIMING_H
 
@@ -7,22 +7,22 @@
 #define CLOCK_HZ 16000000UL
 #define SLOTS_PER_S 8000UL  // conversions, 125 us each: one takes 13.5 clocks of 8 us
 #define AUX_PER_S 100       // readings of bandgap or NTC
-#define AUX_MAX 63          // in a window: their sum has 16 bits
+#define AUX_MAX 63          // readings in a window, because their sum has 16 bits
 
-// The bandgap's source is weak: it takes some 350 us to charge the converter's capacitor. So much is given to it before
-// the readings that count.
+// Slots before the readings that count. The bandgap has a high output impedance: it takes about 350 us to charge the
+// converter's capacitor.
 #define AUX_SETTLING_SLOTS 3
 
 // A slot is the time from one trigger of the converter to the next.
 typedef struct {
     uint16_t rate_hz;
-    uint16_t slots;        // in a sample's window, even: A0 and A1 by turns
+    uint16_t slots;        // in a window; even, because A0 and A1 alternate
     uint16_t slot_cycles;  // CPU clocks in a slot
     uint8_t aux_windows;   // windows from one with aux readings to the next
-    uint8_t aux_readings;  // in such a window, at its end; odd, so that with what settles they take whole pairs
+    uint8_t aux_readings;  // at the end of such a window; odd, so that with the settling slots their number is even
 } window_timing;
 
-// The slots that fit, stretched by whole clocks until they fill the window.
+// Returns the timing of a sample rate. Slots are lengthened by whole clocks to fill the window.
 static inline window_timing timing_of(uint16_t rate_hz) {
     window_timing t;
     t.rate_hz = rate_hz;

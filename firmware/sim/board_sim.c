@@ -1,4 +1,4 @@
-// Runs the firmware's own ELF: readings at its sensors, its serial line as a pseudo-terminal.
+// Simulator that runs the firmware's ELF file, with readings at its sensors and a pseudo-terminal as its line.
 
 #include <getopt.h>
 #include <math.h>
@@ -20,21 +20,21 @@
 
 #define MCUSR_ADDRESS 0x54
 #define WATCHDOG_RESET 0x08
-#define TURN_CYCLES 16000    // of line and clock: 1 ms
-#define BYTE_CYCLES 352      // simavr counts 11 bits a byte where the chip has 10, and drops what comes faster
+#define TURN_CYCLES 16000    // between two calls of ``turn``: 1 ms
+#define BYTE_CYCLES 352      // simavr counts 11 bits a byte instead of 10, and drops faster bytes
 #define NEVER UINT64_MAX
-#define LATE_S 0.05          // later than this is not made up for
-#define BOOT_LOADER_S 0.05   // from the host's opening until the board starts
+#define LATE_S 0.05          // a longer delay is not made up for
+#define BOOT_LOADER_S 0.05   // from the opening of the line by the host to the start of the board
 
 static const char usage[] =
     "usage: board_sim ELF --readings FILE|- [--speed X] [--avcc-mv MV] [--noise-lsb LSB] [--seed N]\n"
     "                     [--loop] [--stop-at-end] [--relay]\n"
     "Prints the path of the board's serial line. The board starts when a host opens it, as an Arduino does.\n"
     "  --readings     lines time_s,current_a,voltage_v[,temperature_c], each held until the next; -: stdin\n"
-    "  --speed        board seconds per second, 1 unless told; inf: as fast as the host reads\n"
-    "  --avcc-mv      supply and reference of the converter, 5000 unless told\n"
-    "  --noise-lsb    standard deviation of a conversion, 0.5 unless told\n"
-    "  --loop         begin again after the last line; else it is held\n"
+    "  --speed        board seconds per second, default 1; inf: as fast as the host reads\n"
+    "  --avcc-mv      supply and reference of the converter, default 5000\n"
+    "  --noise-lsb    standard deviation of a conversion, default 0.5\n"
+    "  --loop         begin again after the last line; default: hold it\n"
     "  --stop-at-end  exit at the last line\n"
     "  --relay        the relay pin cuts the load while it is high\n";
 
@@ -97,7 +97,7 @@ static void turn(double board_s) {
     pace(board_s);
 }
 
-// simavr's own timers would end with a reset of the board: hence by hand.
+// Runs the board, and counts cycles itself: a reset of the board would clear simavr's timers.
 static int run(avr_t *avr, const options *o) {
     avr_cycle_count_t next_turn = 0, next_byte = NEVER;
     while (!stop && !(o->stop_at_end && readings_ended())) {
@@ -121,13 +121,13 @@ static int run(avr_t *avr, const options *o) {
     return 0;
 }
 
-// simavr would sleep in real time here; ``pace`` does it in larger steps.
+// Does nothing, where simavr would sleep in real time; ``pace`` sleeps in larger steps.
 static void skip_sleep(avr_t *avr, avr_cycle_count_t cycles) {
     (void)avr;
     (void)cycles;
 }
 
-// stdout is for the path alone.
+// Prints errors to stderr, because only the path is printed to stdout.
 static void log_errors(avr_t *avr, const int level, const char *format, va_list arguments) {
     (void)avr;
     if (level == LOG_ERROR) vfprintf(stderr, format, arguments);
@@ -190,11 +190,11 @@ int main(int argc, char **argv) {
         return 2;
     }
     if (!readings_open(o.readings, o.loop)) return 2;
-    prctl(PR_SET_PDEATHSIG, SIGTERM);  // a board does not outlive whoever plugged it in
+    prctl(PR_SET_PDEATHSIG, SIGTERM);  // the simulator ends with its parent process
     avr_t *avr = power_up(&o);
     const char *path = avr ? line_open() : NULL;
     if (!path) return 2;
-    const struct sigaction ending = {.sa_handler = on_signal};  // without SA_RESTART: a wait for stdin ends, too
+    const struct sigaction ending = {.sa_handler = on_signal};  // without SA_RESTART, so that a wait for stdin ends
     sigaction(SIGTERM, &ending, NULL);
     sigaction(SIGINT, &ending, NULL);
     printf("%s\n", path);

@@ -8,7 +8,7 @@
 #include <termios.h>
 #include <unistd.h>
 
-#define LOOK_MS 50  // how often a wait looks whether it was called off
+#define LOOK_MS 50  // interval at which a wait checks if it must stop
 
 static int master = -1;
 static char name[128];
@@ -24,7 +24,7 @@ const char *line_open(void) {
         perror("openpty");
         return NULL;
     }
-    close(slave);  // from now on the master sees whether a host is there; its settings stay
+    close(slave);  // the master then detects hosts; the settings remain
     fcntl(master, F_SETFL, O_NONBLOCK);
     return name;
 }

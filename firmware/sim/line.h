@@ -7,18 +7,19 @@
 #include <stddef.h>
 #include <stdint.h>
 
-// Returns the path for the host, NULL and has said why when there is no pseudo-terminal.
+// Returns the path for the host. Without a pseudo-terminal it prints the reason and returns NULL.
 const char *line_open(void);
 
-// Whether a host has it open.
+// Returns true if a host has opened the line.
 bool line_has_host(void);
 
 void line_put(uint8_t byte);
 
-// Writes what was put. Waits while the host does not read, for a simulation has time; what nobody hears is lost.
+// Writes the bytes of line_put. Waits while the host does not read, because simulated time can wait. Without a host the
+// bytes are lost.
 void line_flush(const volatile sig_atomic_t *stop);
 
-// What the host has sent; returns the number of bytes, 0 when there are none.
+// Reads the bytes that the host has sent. Returns their number, which may be 0.
 size_t line_read(uint8_t *to, size_t room);
 
 #endif

@@ -7,7 +7,7 @@
 
 static FILE *file;
 static bool looped;
-static double offset_s;  // of this round
+static double offset_s;  // time offset of the present pass over the file
 static reading held, next;
 static bool have_next;
 
@@ -30,7 +30,7 @@ static void fetch(void) {
     have_next = read_line(&next);
     if (have_next || !looped) return;
     rewind(file);
-    offset_s = held.time_s;  // the last line of a round and the first of the next share their time
+    offset_s = held.time_s;  // the last line of a pass and the first line of the next one have the same time
     have_next = read_line(&next);
 }
 
@@ -58,7 +58,7 @@ const reading *readings_at(double time_s) {
         const bool stands_still = looped && next.time_s <= held.time_s && next.time_s == 0.0;
         held = next;
         fetch();
-        if (stands_still) break;  // a file of one line goes round for ever
+        if (stands_still) break;  // a file of one line would loop forever
     }
     return &held;
 }

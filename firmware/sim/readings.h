@@ -1,4 +1,4 @@
-// What is at the sensors, by time: lines of time_s,current_a,voltage_v[,temperature_c].
+// Readings at the sensors over time, from lines time_s,current_a,voltage_v[,temperature_c].
 #ifndef BOARD_SIM_READINGS_H
 #define BOARD_SIM_READINGS_H
 
@@ -11,13 +11,13 @@ typedef struct {
     double temperature_c;  // NaN: no NTC
 } reading;
 
-// From a file or, with "-", from stdin; a heading is passed over. Returns false, and has said why, when it cannot be read.
+// Opens a file, or stdin for "-", and skips a heading. If it cannot be read, prints the reason and returns false.
 bool readings_open(const char *path, bool loop);
 
-// What holds at time_s since the first line, which never goes back: the last line not after it.
+// Returns the last line that is not later than time_s, the time since the first line. time_s must never decrease.
 const reading *readings_at(double time_s);
 
-// Whether the last line's time has come.
+// Returns true if the time of the last line is reached.
 bool readings_ended(void);
 
 #endif

@@ -12,13 +12,13 @@
 #include "readings.h"
 
 #define DIVIDER 6.1
-#define PART_PER_AMPERE (0.1 / 5.0)  // of its supply
+#define PART_PER_AMPERE (0.1 / 5.0)  // fraction of the supply
 #define BANDGAP_V 1.1
 #define NTC_SERIES_OHM 10e3
 #define NTC_R25_OHM 10e3
 #define NTC_BETA_K 3950.0
 
-enum { PIN_VOLTAGE = 0, PIN_CURRENT = 1, PIN_NTC = 2, PIN_BANDGAP = 7 };  // of the last, no Uno has the pin
+enum { PIN_VOLTAGE = 0, PIN_CURRENT = 1, PIN_NTC = 2, PIN_BANDGAP = 7 };  // an Uno has no pin for the last one
 #define MUX_BANDGAP 14
 
 #define FULL_SCALE 1024.0
@@ -41,7 +41,7 @@ enum { PIN_VOLTAGE = 0, PIN_CURRENT = 1, PIN_NTC = 2, PIN_BANDGAP = 7 };  // of 
 static avr_t *board;
 static converter parts;
 static bool trigger_armed = true;
-static avr_cycle_count_t last_compare;  // with OCR1B: the counter's zero, but for a few cycles
+static avr_cycle_count_t last_compare;  // compare match with OCR1B, a few cycles after the counter's zero
 
 static double uniform(void) {  // xorshift64*, in (0, 1)
     parts.seed ^= parts.seed >> 12;
@@ -75,8 +75,8 @@ static double pin_v(unsigned pin) {
     }
 }
 
-// simavr takes whole millivolts and counts 1023 steps. So the conversion is made here, with noise, as the data sheet
-// has it (1024 steps), and handed over as the millivolts that simavr turns into just that number.
+// simavr accepts whole millivolts only and counts 1023 steps. Therefore the conversion is computed here, with noise and
+// the 1024 steps of the data sheet, and passed on as the millivolts that simavr converts to the same number.
 static void convert(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     union {
@@ -89,7 +89,7 @@ static void convert(struct avr_irq_t *irq, uint32_t value, void *param) {
     avr_raise_irq((avr_irq_t *)param + started.mux.src, millivolts);
 }
 
-// simavr leaves the converter's trigger by timers to others. As on the chip, the flag must have been cleared since.
+// Triggers the converter by the timer, which simavr does not. As on the chip, the flag must be cleared before the next one.
 static void compare_b(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     if (!value) return;
@@ -105,8 +105,8 @@ static void write_tifr1(struct avr_irq_t *irq, uint32_t value, void *param) {
     if (value & (1 << OCF1B_BIT)) trigger_armed = true;
 }
 
-// simavr takes a new top wherever the counter stands. The chip does not in CTC mode, which has no double buffering: a
-// counter beyond the new top goes on to 65535, and 4 ms pass that no sample counts.
+// simavr accepts a new top at any count. The chip does not in CTC mode, which has no double buffering: a counter beyond
+// the new top counts to 65535, and 4 ms are missing in the samples.
 static void write_top(struct avr_irq_t *irq, uint32_t value, void *param) {
     (void)irq;
     (void)value;

@@ -13,7 +13,7 @@ typedef struct {
     bool relay;  // the board's pin D4 cuts the load while it is high
 } converter;
 
-// Lets timer 1 trigger the converter and feeds each conversion with what the readings say at its moment.
+// Makes timer 1 trigger the converter, and supplies each conversion with the readings of its time.
 void sensors_attach(avr_t *avr, const converter *c);
 
 #endif

@@ -57,7 +57,7 @@ def addon(deploy, tmp_path, supervisor, monkeypatch):
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     places = {"SETTINGS": tmp_path / "config", "DATA": tmp_path / "data", "SUPERVISOR": supervisor}
-    for name, value in (places | {"PAGE": f"127.0.0.1:{free_port()}", "INGRESS_PORT": free_port()}).items():
+    for name, value in (places | {"PAGE_ADDRESS": f"127.0.0.1:{free_port()}", "INGRESS_PORT": free_port()}).items():
         monkeypatch.setattr(script, name, value)
     for folder in ("config", "data"):
         (tmp_path / folder).mkdir()
@@ -71,7 +71,7 @@ def addon(deploy, tmp_path, supervisor, monkeypatch):
 def test_addon_uses_the_broker_of_home_assistant(addon, tmp_path):
     pack = tmp_path / "pack.toml"
     pack.write_text(PACK)
-    settings = load_settings(addon.complete(pack, addon.DATA, addon.SUPERVISOR, "token"))
+    settings = load_settings(addon.complete_settings(pack, addon.DATA, addon.SUPERVISOR, "token"))
     assert settings.pack.cell == "chen_mora"
     assert settings.mqtt
     assert (settings.mqtt.urls, settings.mqtt.username) == (("mqtt://core-mosquitto:1883",), "addons")
@@ -83,7 +83,7 @@ def test_addon_uses_the_broker_of_home_assistant(addon, tmp_path):
 def test_addon_keeps_the_broker_of_the_settings(addon, tmp_path):
     pack = tmp_path / "pack.toml"
     pack.write_text(f'{PACK}[mqtt]\nurl = "mqtt://elsewhere"\n')
-    settings = load_settings(addon.complete(pack, addon.DATA, "http://127.0.0.1:1", "token"))
+    settings = load_settings(addon.complete_settings(pack, addon.DATA, "http://127.0.0.1:1", "token"))
     assert settings.mqtt.urls == ("mqtt://elsewhere",)
 
 
@@ -127,7 +127,7 @@ async def test_ingress_shows_the_setup_and_then_the_pack(addon, monkeypatch):
 async def test_ingress_rejects_other_clients(addon):
     url = f"http://127.0.0.1:{addon.INGRESS_PORT}/"
     async with (
-        addon.ingress(addon.PAGE, "token", "172.30.32.2", addon.INGRESS_PORT),
+        addon.ingress(addon.PAGE_ADDRESS, "token", "172.30.32.2", addon.INGRESS_PORT),
         aiohttp.ClientSession() as other,
         other.get(url) as response,
     ):

@@ -1,4 +1,4 @@
-"""Start of the add-on: the setup page without settings, then the service; both are shown by Home Assistant's ingress."""
+"""Start the add-on: the setup page until there are settings, then the service. Home Assistant's ingress shows their pages."""
 
 import asyncio
 import contextlib
@@ -23,7 +23,7 @@ INGRESS_PEER = "172.30.32.2"
 """Address of Home Assistant's ingress, which has authenticated the user."""
 INGRESS_PORT = 8099
 """Port of ``config.yaml``."""
-PAGE = "127.0.0.1:8765"
+PAGE_ADDRESS = "127.0.0.1:8765"
 """Address of setup page and live page in the container."""
 TIMEOUT_S = 10.0
 """Timeout of a request to the Supervisor [s]."""
@@ -32,7 +32,7 @@ POLL_S = 1.0
 STARTING = '<!doctype html><meta http-equiv="refresh" content="2"><p>Starting...</p>'
 """Page while the program does not listen yet."""
 NOT_FORWARDED = {"connection", "content-length", "host", "keep-alive", "transfer-encoding"}
-"""Headers of one connection, in lower case."""
+"""Hop-by-hop headers, which are not forwarded, in lower case."""
 
 
 def broker_of_home_assistant(supervisor: str, token: str) -> dict[str, object]:
@@ -42,7 +42,7 @@ def broker_of_home_assistant(supervisor: str, token: str) -> dict[str, object]:
         return dict(json.load(response)["data"])
 
 
-def complete(pack: Path, data: Path, supervisor: str, token: str) -> Path:
+def complete_settings(pack: Path, data: Path, supervisor: str, token: str) -> Path:
     """Return a copy of the user's settings file, with Home Assistant's broker and the page where they are not set.
 
     Args:
@@ -52,7 +52,7 @@ def complete(pack: Path, data: Path, supervisor: str, token: str) -> Path:
         token: Token for the Supervisor.
     """
     settings = tomlkit.parse(pack.read_text(encoding="utf-8"))
-    settings["page"] = {"listen": PAGE, "token_file": str(page_token(data))}
+    settings["page"] = {"listen": PAGE_ADDRESS, "token_file": str(page_token(data))}
     if "mqtt" not in settings:
         broker = broker_of_home_assistant(supervisor, token)
         settings["mqtt"] = {
@@ -80,7 +80,7 @@ def private_file(file: Path, text: str) -> Path:
 
 @contextlib.asynccontextmanager
 async def ingress(page: str, token: str, peer: str, port: int):  # noqa: ANN201 - an iterator of nothing
-    """Serve the page at ``page`` to Home Assistant's ingress, below the path that it names in each request."""
+    """Serve the page at the address ``page`` to Home Assistant's ingress."""
     async with aiohttp.ClientSession(
         auto_decompress=False, timeout=aiohttp.ClientTimeout(total=None, connect=TIMEOUT_S)
     ) as session:
@@ -94,7 +94,7 @@ async def ingress(page: str, token: str, peer: str, port: int):  # noqa: ANN201 
             try:
                 sent = session.request(request.method, url, headers=headers, data=body, allow_redirects=False)
                 async with sent as answer:
-                    return await answer_to(request, answer)
+                    return await forward_answer(request, answer)
             except aiohttp.ClientConnectorError:
                 return web.Response(status=503, text=STARTING, content_type="text/html")
 
@@ -109,8 +109,8 @@ async def ingress(page: str, token: str, peer: str, port: int):  # noqa: ANN201 
             await runner.cleanup()
 
 
-async def answer_to(request: web.Request, answer: aiohttp.ClientResponse) -> web.StreamResponse:
-    """Send the page's answer as it arrives. A redirect stays below the path of the ingress."""
+async def forward_answer(request: web.Request, answer: aiohttp.ClientResponse) -> web.StreamResponse:
+    """Forward the page's response as it arrives. A redirect stays below the path of the ingress."""
     response = web.StreamResponse(status=answer.status)
     for name, value in answer.headers.items():
         if name.lower() not in NOT_FORWARDED:
@@ -149,14 +149,14 @@ async def main() -> int:
     """Run the setup page until there are settings, then the service."""
     options = json.loads((DATA / "options.json").read_text(encoding="utf-8"))
     pack, token_file = SETTINGS / options["pack_file"], page_token(DATA)
-    async with ingress(PAGE, token_file.read_text(encoding="utf-8"), INGRESS_PEER, INGRESS_PORT):
+    async with ingress(PAGE_ADDRESS, token_file.read_text(encoding="utf-8"), INGRESS_PEER, INGRESS_PORT):
         if not pack.exists():
-            setup = ("setup", str(pack), "--listen", PAGE, "--token-file", str(token_file), "--no-browser")
+            setup = ("setup", str(pack), "--listen", PAGE_ADDRESS, "--token-file", str(token_file), "--no-browser")
             code = await run_program(*setup, until=pack)
             if not pack.exists():
                 return code
         try:
-            completed = complete(pack, DATA, SUPERVISOR, os.environ["SUPERVISOR_TOKEN"])
+            completed = complete_settings(pack, DATA, SUPERVISOR, os.environ["SUPERVISOR_TOKEN"])
         except OSError as error:
             sys.exit(
                 f"Home Assistant offers no MQTT broker ({error}): install the add-on Mosquitto broker, or set [mqtt]"
