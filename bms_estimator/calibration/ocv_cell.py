@@ -1,7 +1,7 @@
 """Cell model from captures: open-circuit voltage from rests and low-rate curves, and first resistances from the rests."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -123,6 +123,8 @@ def determine_ocv(
     if form is OcvForm.TABLE and sources.hysteresis_v is None and has_plateau(NODES, preliminary_v, series_count):
         sources = center_on_typical_hysteresis(sources, np.interp(NODES, *generic_curve(generic, "hysteresis_v")))
     fit = _fit_curve(form, sources.points)
+    if isinstance(fit, TableFit) and fit.per_kelvin_v is None:
+        fit = replace(fit, per_kelvin_v=_given_coefficient(curves))
     _check_ends(fit, sources)
     sections = _cell_and_ocv_sections(name, series_count, fit, sources, recordings)
     cell = CellModel.model_validate({**sections, "ladder": ladder, **elements})
@@ -170,6 +172,12 @@ def _discharged_ah(recording: Recording) -> float:
 
 def _fit_curve(form: OcvForm, points: Points) -> ChenMoraFit | TableFit:
     return fit_table(points) if form is OcvForm.TABLE else fit_chen_mora(points)
+
+
+def _given_coefficient(curves: Sequence[ExternalCurve]) -> Floats | None:
+    """Return the mean temperature coefficient of given curves at ``NODES`` [V/K]; None if no curve has one."""
+    given_v = [np.interp(NODES, each.soc, each.per_kelvin_v) for each in curves if each.per_kelvin_v is not None]
+    return np.mean(given_v, axis=0) if given_v else None
 
 
 def _checked_voltage(recording: Recording) -> NDArray[np.float64]:

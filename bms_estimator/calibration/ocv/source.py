@@ -36,6 +36,7 @@ class ExternalCurve:
         ocv_v: Shape (n,), open-circuit voltage [V].
         hysteresis_v: Shape (n,), hysteresis [V]; None if unknown.
         std_v: Shape (n,), std of ``ocv_v`` [V]; None if unknown.
+        per_kelvin_v: Shape (n,), temperature coefficient of ``ocv_v`` [V/K]; None if unknown.
     """
 
     name: str
@@ -43,6 +44,7 @@ class ExternalCurve:
     ocv_v: Floats
     hysteresis_v: Floats | None
     std_v: Floats | None = None
+    per_kelvin_v: Floats | None = None
 
 
 @dataclass(frozen=True)

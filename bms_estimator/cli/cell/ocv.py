@@ -139,7 +139,7 @@ def ocv(
     The OCV is determined from files of three kinds. The kind is detected from the content:
     captures with rests, such as HPPC or relaxation tests;
     captures of slow discharges and charges;
-    OCV curves in CSV files with the columns soc, ocv_v and, optionally, hysteresis_v and std_v.
+    OCV curves in CSV files with the columns soc, ocv_v and, optionally, hysteresis_v, std_v and per_kelvin_v.
     The files may have been recorded at different temperatures.
 
     The cell file also contains resistances, estimated from the rests and the most similar generic cell.

@@ -12,7 +12,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
 
-OCV_COLUMNS = ("soc", "ocv_v", "hysteresis_v", "std_v")
+OCV_COLUMNS = ("soc", "ocv_v", "hysteresis_v", "std_v", "per_kelvin_v")
 POLARISATION_COLUMNS = ("current_a", "voltage_v", "temperature_c")
 
 
@@ -24,10 +24,12 @@ class CurveColumns(NamedTuple):
     hysteresis_v: Floats | None
     std_v: Floats | None
     """Standard deviation of ``ocv_v``."""
+    per_kelvin_v: Floats | None
+    """Temperature coefficient of ``ocv_v``."""
 
 
 def read_curve(path: Path) -> CurveColumns | None:
-    """Read the curve in a CSV file (.gz) with columns soc (0..1), ocv_v [V] and optional hysteresis_v and std_v [V].
+    """Read the curve in a CSV file (.gz) with columns soc (0..1), ocv_v [V] and optional hysteresis_v, std_v [V] and per_kelvin_v [V/K].
 
     Returns:
         None if the file is not CSV or has no such columns.
@@ -99,7 +101,7 @@ def _make_curve(path: Path, values: Floats) -> CurveColumns:
         raise UserError(f"{path}: {'no rows' if soc.size == 0 else 'a value is missing'}: give numbers in every column")
     if soc[0] < 0.0 or soc[-1] > 1.0:
         raise UserError(f"{path}: soc runs from {soc[0]:g} to {soc[-1]:g}: must lie within 0..1, not percent")
-    hysteresis_v, std_v = given
+    hysteresis_v, std_v, per_kelvin_v = given
     if std_v is not None and std_v.min() <= 0.0:
         raise UserError(f"{path}: std_v = {std_v.min():g}: must be above 0 (standard deviation of ocv_v in volts)")
-    return CurveColumns(soc, ocv_v, hysteresis_v, std_v)
+    return CurveColumns(soc, ocv_v, hysteresis_v, std_v, per_kelvin_v)

@@ -197,6 +197,15 @@ def test_sign_of_the_current_is_an_option(tmp_path, capsys):
     assert "20 rests of charge.csv" in (tmp_path / "c.toml").read_text()
 
 
+def test_a_given_temperature_coefficient_is_written_to_the_cell_file(tmp_path, capsys):
+    curve, out = tmp_path / "curve.csv", tmp_path / "cell.toml"
+    rows = [f"{soc:.2f},{3.0 + 1.2 * soc:.4f},{1e-4 * (2.0 * soc - 1.0):.3g}" for soc in np.linspace(0.0, 1.0, 21)]
+    curve.write_text("\n".join(["soc,ocv_v,per_kelvin_v", *rows]))
+    assert run(capsys, "ocv", curve, "--capacity-ah", "3", "--out", out)[0] == 0
+    ocv = load_cell(out).ocv
+    assert ocv.per_kelvin_v == pytest.approx(1e-4 * (2.0 * np.array(ocv.soc) - 1.0), abs=1e-9)
+
+
 def test_kinds_of_captures_are_recognized_and_combined_to_one_curve(tmp_path, capsys, data):
     """The captures are a slow discharge and a tabulated curve with hysteresis."""
     out = tmp_path / "m50.toml"

@@ -11,12 +11,15 @@ from bms_estimator.sources.captures.curves import read_curve
 def test_curve_is_read_sorted_by_soc_from_plain_and_compressed_files(tmp_path):
     path = tmp_path / "c.csv"
     path.write_text("# a comment\nocv_v,soc\n4.2,1\n3.0,0\n3.7,0.5\n")
-    soc, ocv_v, hysteresis_v, std_v = read_curve(path)
-    assert (soc.tolist(), ocv_v.tolist(), hysteresis_v, std_v) == ([0.0, 0.5, 1.0], [3.0, 3.7, 4.2], None, None)
+    soc, ocv_v, *optional = read_curve(path)
+    assert (soc.tolist(), ocv_v.tolist(), optional) == ([0.0, 0.5, 1.0], [3.0, 3.7, 4.2], [None, None, None])
     compressed = tmp_path / "c.csv.gz"
-    compressed.write_bytes(gzip.compress(b"soc,ocv_v,std_v,hysteresis_v\n0,3.0,3e-3,0.01\n1,4.2,4e-3,0.02\n"))
+    compressed.write_bytes(
+        gzip.compress(b"soc,ocv_v,std_v,hysteresis_v,per_kelvin_v\n0,3.0,3e-3,0.01,-2e-4\n1,4.2,4e-3,0.02,1e-4\n")
+    )
     curve = read_curve(compressed)
     assert (curve.hysteresis_v.tolist(), curve.std_v.tolist()) == ([0.01, 0.02], [3e-3, 4e-3])
+    assert curve.per_kelvin_v.tolist() == [-2e-4, 1e-4]
 
 
 def test_a_std_of_zero_is_rejected(tmp_path):
