@@ -15,13 +15,17 @@ from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warni
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.protocols.registry import make_protocol
+from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.sources.mqtt import MqttSource
 from bms_estimator.sources.factory import open_source
 from bms_estimator.sources.serial.known_board_file import STORED_FIELDS, KnownBoardFile
 from bms_estimator.sources.serial.port_list import NoPortError, holder, resolve_port
 
 NAME = "device"
-FIRST_SAMPLE_TIMEOUT_S = 8.0
-"""Time within which a device must send a sample [s]. Opening the port may reset a board, whose boot loader takes 2 s."""
+MIN_FIRST_SAMPLE_TIMEOUT_S = 8.0
+"""Minimum time within which a device must send a sample [s]. Opening the port may reset a board, whose boot loader takes 2 s."""
+MIN_FIRST_SAMPLE_PERIODS = 2.0
+"""Minimum of that time in sample periods of the source."""
 CELLS_TIMEOUT_S = 2.0
 """Time after the first sample within which a device sends all cell voltages [s]. Some report them in several responses."""
 PSEUDO_TERMINALS = "/dev/pts/"
@@ -62,6 +66,12 @@ class FirstSample:
         current = "no current" if math.isnan(self.current_a) else f"{self.current_a:.3f} A"
         names = ", ".join(f"{name} {self.board[name]}" for name in ("firmware", "serial") if self.board.get(name))
         return f"{self.voltage_v:.3f} V, {current}{f'; {names}' if names else ''}"
+
+
+def first_sample_timeout_s(settings: Settings) -> float:
+    """Return the time within which the device must send a sample [s]."""
+    silent_s = settings.source.max_silent_s if isinstance(settings.source, MqttSource) else None
+    return max(MIN_FIRST_SAMPLE_TIMEOUT_S, MIN_FIRST_SAMPLE_PERIODS * settings.sensor.sample_period_s, silent_s or 0.0)
 
 
 def load_decoder(subject: ExaminedPack) -> None:
@@ -125,10 +135,10 @@ async def _first_sample(subject: ExaminedPack) -> FirstSample:
         NoSampleError: No sample arrives. The message is the reason.
     """
     source = open_source(subject.settings)
-    series, sample = subject.model.cell.series_count, None
+    series, sample, timeout_s = subject.model.cell.series_count, None, first_sample_timeout_s(subject.settings)
     async with source:
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(FIRST_SAMPLE_TIMEOUT_S) as limit:
+            async with asyncio.timeout(timeout_s) as limit:
                 async for received in source:
                     last = received.samples[-1]
                     cells = max(is_live(received.cells_v).sum(axis=1), default=0)
@@ -139,7 +149,7 @@ async def _first_sample(subject: ExaminedPack) -> FirstSample:
                     if sample.cells == series or sample.board.get("bandgap_v"):
                         break
         if sample is None:
-            raise NoSampleError(source.silence_reason or f"no sample within {FIRST_SAMPLE_TIMEOUT_S:g} s")
+            raise NoSampleError(source.silence_reason or f"no sample within {timeout_s:g} s")
         return sample
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.forecast.forecast import ForecastCurve
 from bms_estimator.forecast.given_load import GivenLoad
-from bms_estimator.forecast.load_history import LoadSpread
+from bms_estimator.forecast.load_history import MINUTE_S, LoadSpread
 from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
 from bms_estimator.kernels.forecast.draws import DRAW, draw_load_factors, draw_packs
 from bms_estimator.kernels.forecast.given_load import LOAD_PART, set_decays, simulate_given_load
@@ -131,7 +131,7 @@ def project_observed_load(
     draws = _draws(m, seed)
     draw_load_factors(spread.std, spread.degrees, draws)
     simulate_observed_load(m, blocks, float(block_s), steps, draws)
-    parts_of_draws = list(_analogue_parts(pack, analogues, horizon_s))
+    parts_of_draws = list(analogue_parts(pack, analogues, horizon_s))
     for followers, parts in parts_of_draws:
         outcomes, no_points = draws[followers], np.empty((followers.size, 0))
         simulate_given_load(m, parts, horizon_s, outcomes, math.inf, no_points, no_points)
@@ -152,13 +152,19 @@ def project_observed_load(
     return Projection(time_s, charge_as, _curve(elapsed_s, soc, voltage_v, time_s))
 
 
-def _analogue_parts(
+def analogue_parts(
     pack: Records, analogues: Sequence[GivenLoad], horizon_s: float
 ) -> Iterator[tuple[NDArray[np.int64], Records]]:
-    """Yield the indices of the draws that follow each analogue, and its parts, corrected for the offset of the sensor."""
+    """Yield the indices of the draws that follow each analogue, and its parts, corrected for the offset of the sensor.
+
+    The parts of a load are limited by the horizon, because an analogue of the first days is as long as the whole history.
+    """
+    block_s = MINUTE_S * math.ceil(horizon_s / (MAX_STEPS * MINUTE_S))
     for number, load in enumerate(analogues):
-        true_load = replace(load, current_a=load.current_a - pack["offset_a"][0])
-        yield np.arange(number, DRAWS, len(analogues) + DRAWN_LOADS_WEIGHT), _parts(true_load, horizon_s)
+        reached = np.cumsum(load.duration_s) - load.duration_s < horizon_s + block_s
+        current_a = load.current_a[reached] - pack["offset_a"][0]
+        true_load = GivenLoad(load.duration_s[reached], current_a, load.power_w[reached])
+        yield np.arange(number, DRAWS, len(analogues) + DRAWN_LOADS_WEIGHT), _parts(true_load, horizon_s, block_s)
 
 
 def project_given_load(pack: Records, load: GivenLoad, seed: int) -> Projection:
@@ -246,9 +252,9 @@ def _draw_count(parts: Records, horizon_s: float) -> int:
     return min(max(MAX_TOTAL_STEPS // steps, MIN_DRAWS), DRAWS)
 
 
-def _parts(load: GivenLoad, horizon_s: float) -> Records:
-    """Return the parts of a load for a horizon: long parts are divided, and short ones merged."""
-    load = condense(load, max(horizon_s / MAX_BLOCKS, MIN_GIVEN_BLOCK_S))
+def _parts(load: GivenLoad, horizon_s: float, block_s: float | None = None) -> Records:
+    """Return the parts of a load for a horizon: long parts are divided, and those within a block of ``block_s`` [s] are merged."""
+    load = condense(load, block_s or max(horizon_s / MAX_BLOCKS, MIN_GIVEN_BLOCK_S))
     max_part_s = max(horizon_s / MAX_STEPS, MIN_GIVEN_BLOCK_S)
     pieces = np.ceil(load.duration_s / max_part_s).astype(int)
     parts = np.zeros(int(pieces.sum()), LOAD_PART)

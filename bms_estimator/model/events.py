@@ -1,6 +1,7 @@
 """Events of a pack for the topic ``event``, from the differences between successive snapshots."""
 
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Literal, NamedTuple
 
 from pydantic import Field
@@ -93,29 +94,26 @@ def _alarm_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[Event
     An alarm that was cleared and raised again between the snapshots has another ``since``. Alarms that were raised before
     the start are skipped, because the previous run reported them.
     """
-    previous_since = {alarm.name: alarm.since for alarm in before.alarms} if before else {}
+    previous = {alarm.name: alarm for alarm in before.alarms} if before else {}
+    previous_since = {name: alarm.since for name, alarm in previous.items()}
     for alarm in snapshot.alarms:
         since = previous_since.get(alarm.name)
         if since is not None and since != alarm.since:
             yield EventText("alarm_cleared", alarm.name)
         if alarm.since is not None and since != alarm.since and alarm.since >= snapshot.info.started:
             yield EventText("alarm_raised", f"{alarm.name}: {alarm.text}")
-    yield from _watch_events(before, snapshot)
+    was_watched = {name: alarm.watched for name, alarm in previous.items()}
+    yield from watch_events(a for a in snapshot.alarms if a.watched != was_watched.get(a.name, True))
 
 
-def _watch_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[EventText]:
-    """Yield alarms whose quantity has become unavailable or available."""
-    was_watched = {alarm.name: alarm.watched for alarm in before.alarms} if before else {}
-    for alarm in snapshot.alarms:
-        if alarm.watched != was_watched.get(alarm.name, True):
-            yield watch_event(alarm)
-
-
-def watch_event(alarm: Alarm) -> EventText:
-    """Return the event of an alarm whose quantity has become unavailable or available."""
-    if alarm.watched:
-        return EventText("alarm_watched", alarm.name)
-    return EventText("alarm_unwatched", f"{alarm.name}: {alarm.unwatched_reason}")
+def watch_events(alarms: Iterable[Alarm]) -> Iterator[EventText]:
+    """Yield the events of alarms whose quantities have become unavailable or available: one event for each reason."""
+    names = defaultdict[str | None, list[str]](list)
+    for alarm in alarms:
+        names[alarm.unwatched_reason].append(alarm.name)
+    for reason, group in names.items():
+        text = ", ".join(group) if len(group) == 1 else f"{len(group)} alarms ({', '.join(group)})"
+        yield EventText("alarm_watched", text) if reason is None else EventText("alarm_unwatched", f"{text}: {reason}")
 
 
 def _gap_event(gap_s: float) -> Iterator[EventText]:

@@ -9,6 +9,7 @@ import structlog
 
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
+from bms_estimator.model.events import watch_events
 from bms_estimator.model.payloads.health import HookHealth
 from bms_estimator.pack.pack import Pack, RunResult
 from bms_estimator.settings.alarm_kinds import Quantity
@@ -207,13 +208,13 @@ class AlarmMonitor:
         changes = self.alarms.changes()
         for change in changes:
             alarm = change.alarm
-            if change.field == "watched":
-                write_log = log.info if alarm.watched else log.warning
-                write_log("alarm watched", alarm=alarm.name, watched=alarm.watched, reason=alarm.unwatched_reason)
-            elif alarm.active:
+            if change.field == "active" and alarm.active:
                 log.warning("alarm raised", alarm=alarm.name, severity=alarm.severity, reason=alarm.text)
-            else:
+            elif change.field == "active":
                 log.info("alarm cleared", alarm=alarm.name)
             self._on_alarm(change)
             self.changed.set()
+        for event in watch_events(change.alarm for change in changes if change.field == "watched"):
+            write_log = log.info if event.name == "alarm_watched" else log.warning
+            write_log(event.name.replace("_", " "), alarms=event.text)
         return bool(changes)

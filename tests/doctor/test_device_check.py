@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.doctor import device_check
-from bms_estimator.doctor.device_check import check_board, check_device
+from bms_estimator.doctor.device_check import check_board, check_device, first_sample_s
 from bms_estimator.doctor.finding import Level
 from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.simulation.simulated_bms import SimulatedBms
@@ -58,6 +58,16 @@ def test_a_silent_device_is_a_fault(tmp_path: Path, line: Line, monkeypatch: pyt
     assert device.level is Level.FAULT
     assert "no frame yet" in device.text
     assert "ports --probe" in device.remedy
+
+
+@pytest.mark.parametrize(
+    ("source", "wait_s"), [({}, 8.0), ({"interval_s": 30.0}, 60.0), ({"max_silent_s": 90.0}, 90.0)]
+)
+def test_a_source_has_time_for_two_samples_and_for_its_longest_silence(
+    tmp_path: Path, source: dict[str, float], wait_s: float
+) -> None:
+    mqtt = {"kind": "mqtt", "topic": "bms", "voltage": "v", "current": "i", "interval_s": 1.0} | source
+    assert first_sample_s(subject(tmp_path, source=mqtt).settings) == wait_s
 
 
 def test_another_number_of_cells_than_in_series_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

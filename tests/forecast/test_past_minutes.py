@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import MINUTE_S, PEAK_S, LoadHistory, PastMinutes
+from bms_estimator.forecast.projection import MAX_STEPS, analogue_parts
+from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK
 from bms_estimator.kernels.trace import TRACE
 
 CAPACITY_AS = 3.0 * 3600.0
@@ -55,3 +58,21 @@ def test_too_short_a_load_has_no_analogue() -> None:
     drive = route(1)
     past, load = after_drives(drive, drive[: 10 * MINUTE_S])
     assert past.analogues(load.seconds // MINUTE_S) == []
+
+
+def test_an_analogue_of_months_is_followed_in_few_parts_that_keep_mean_and_peak_until_the_horizon() -> None:
+    minutes, horizon_s = 20_000, 180_000.0
+    mean_a = np.random.default_rng(4).uniform(5.0, 11.0, minutes)
+    current_a = np.stack([mean_a, np.full(minutes, 40.0)], axis=1).ravel()
+    load = GivenLoad(np.tile([MINUTE_S - PEAK_S, PEAK_S], minutes), current_a, np.full(2 * minutes, np.nan))
+    [(_, parts)] = analogue_parts(np.zeros(1, PROJECTED_PACK), [load], horizon_s)
+    assert parts.size <= 4 * MAX_STEPS
+    reached_s = float(parts["duration_s"].sum())
+    assert horizon_s <= reached_s <= horizon_s + 2 * horizon_s / MAX_STEPS
+    reached = np.cumsum(load.duration_s) <= reached_s
+    means_a = [
+        np.average(c, weights=d)
+        for c, d in ((load.current_a[reached], load.duration_s[reached]), (parts["current_a"], parts["duration_s"]))
+    ]
+    assert means_a[0] == pytest.approx(means_a[1], rel=1e-9)
+    assert parts["current_a"].max() == 40.0

@@ -1,6 +1,7 @@
 """Screenshots of the page for the documentation (``make screenshots``), of an LFP battery of a house with 16 cells.
 
-The battery is simulated faster than real time, and its published snapshots are shown by the page of a service.
+The battery is simulated faster than real time, with a forecast each hour, and its published snapshots are shown by the page of a
+service.
 """
 
 import asyncio
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from playwright.async_api import Browser, expect
 
+from bms_estimator.forecast import forecaster
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.pack.pack import new_pack
@@ -86,8 +88,9 @@ class House:
                 self.settings, self.pack, source=ScriptedSource(), sinks=[self.collector, sink], clock=clock
             )
             while (rest_s := 86_400.0 * self.days - LIVE_S - self.time_s) > 0.0:
-                minutes = 60 if rest_s > 86_400.0 else 5  # each publication computes a forecast
-                self.publish(publisher, [self.run(STEP_S) for _ in range(minutes)])
+                minutes = 60 if rest_s > 86_400.0 else 5
+                with patch.multiple(forecaster, RETRY_S=3600.0, MIN_INTERVAL_S=3600.0, MAX_INTERVAL_S=3600.0):
+                    self.publish(publisher, [self.run(STEP_S) for _ in range(minutes)])
             while self.time_s < 86_400.0 * self.days:
                 minute = self.run(1.0)
                 for parts in zip(*(np.split(part, 60) for part in minute), strict=True):
@@ -154,8 +157,8 @@ async def shoot_first_day(folder: Path, browser: Browser) -> None:
 
 
 async def shoot_weeks(folder: Path, browser: Browser) -> None:
-    """Write screenshots of a pack after a month, discharging."""
-    async with House(30.0, 0.6, 20.0).page(folder) as url:
+    """Write screenshots of a pack after a week, discharging."""
+    async with House(7.0, 0.6, 20.0).page(folder) as url:
         async with open_page(browser, url) as page_tab:
             await shoot(page_tab, "desktop")
             await shoot(page_tab, "cells", ".cells")

@@ -298,6 +298,9 @@ async def test_the_weakest_and_faulty_cells_are_named(browser: Browser, programs
         name = page_tab.page.locator("[data-q=weakestcell]")
         await name.get_by_text("cell 2, SOC 47.0 ± 2.0 %").wait_for()
         assert (await name.inner_text()).endswith("; cell 2: internal short; cell 3: contact")
+        bar = page_tab.page.get_by_role("img", name="cell 2: 3.276 V, weakest")  # cell 4 has the lowest voltage
+        assert await bar.is_visible()
+        assert await page_tab.page.locator("#cells .weakest").count() == 1
         assert page_tab.errors == []
 
 
@@ -407,7 +410,31 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, programs: 
         text = await element.inner_text()
         assert "cell voltages are missing" in text
         assert "cannot be watched" in text
-        await publish(programs.live, "alarm/cell_under_voltage", b"")
+        other = unwatched.model_copy(update={"name": "cell_over_voltage"})
+        await publish(programs.live, "alarm/cell_over_voltage", other.model_dump_json())
+        rows = page_tab.page.locator(".alarm")
+        await rows.get_by_text("cell under voltage, cell over voltage").wait_for()
+        assert await rows.count() == 1
+        named = {"name": "sensor_fault", "text": "cell voltages are missing: cell_under_voltage cannot be raised"}
+        await publish(programs.live, "alarm/sensor_fault", alarm.model_copy(update=named).model_dump_json())
+        await rows.get_by_text("sensor fault").wait_for()
+        assert await rows.count() == 1
+        for name in ("cell_under_voltage", "cell_over_voltage", "sensor_fault"):
+            await publish(programs.live, f"alarm/{name}", b"")
+        assert page_tab.errors == []
+
+
+async def test_live_curves_are_interrupted_where_samples_are_missing(
+    browser: Browser, programs: RunningPrograms
+) -> None:
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        for second in (0, 1, 2, 30, 31):
+            await publish_state(programs.live, voltage_v=40.0 + second, time=f"2026-11-23T16:04:{second:02}.000Z")
+        drawn = """async () => {
+            const [time, , , voltage] = (await import("./curves.js")).curves.v?.plot.data ?? [[], [], [], []];
+            return JSON.stringify(voltage.slice(time.indexOf(Date.parse("2026-11-23T16:04:00Z") / 1e3))) === "[40,41,42,null,70,71]";
+        }"""
+        await page_tab.until(drawn)
         assert page_tab.errors == []
 
 

@@ -17,7 +17,7 @@ from bms_estimator.kernels.alarms.evaluate import begin_time_base, mark_reported
 from bms_estimator.kernels.alarms.quantities import lost_quantities
 from bms_estimator.kernels.alarms.records import COUNTS, ENDED, NAMES, RAISED, WATCH_CHANGED
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.events import Event, EventText, fit_event, input_fault_events, soc_events, watch_event
+from bms_estimator.model.events import Event, EventText, fit_event, input_fault_events, soc_events, watch_events
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock, SampleStatus
@@ -163,7 +163,7 @@ class PackAlarms:
             yield _event(EventText("alarm_cleared", definition.name), now_s)
         present = payload(state, is_raised=is_raised)
         if WATCH_CHANGED in changes:
-            yield _event(watch_event(present), now_s)
+            yield from (_event(text, now_s) for text in watch_events((present,)))
         yield _message(present)
 
     def _events(self, pack_type: PackType) -> Iterator[EventText]:

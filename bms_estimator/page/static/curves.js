@@ -3,6 +3,7 @@ import { Curve, clip, nullGaps, nulls, scaled } from "./charts.js";
 import { $, hide, text } from "./dom.js";
 
 const SPANS = { live: 300, hour: 3600, day: 86400, month: 30 * 86400 }; // [s]
+const LIVE_STEP_S = 4; // shortest step of the live curves [s]: gaps below 10 s are not drawn
 const HISTORY_MS = 60_000; // shortest time between two requests for a history
 export const curves = {};
 
@@ -47,17 +48,22 @@ function socColumns(soc, std) {
 }
 
 function liveColumns(pack) {
-	const [time, v, estimate, i, soc, std, inno] = pack.recent.views(pack.recent.last - SPANS.live), no = nulls(time);
+	const [times, ...values] = pack.recent.views(pack.recent.last - SPANS.live), step = Math.max((times.at(-1) - times[0]) / times.length, LIVE_STEP_S);
+	const [time, pick] = withGaps(times, step), [v, estimate, i, soc, std, inno] = values.map(pick), no = nulls(time);
 	return { time, v: [no, no, nullGaps(v), nullGaps(estimate)], i: [no, no, nullGaps(i)], soc: socColumns(soc, std), inno: [no, no, scaled(inno, 1e3)] };
 }
 
-/** Columns of a history, with a gap after 2.5 steps without a row. */
-function pastColumns(data) {
+/** Times with a gap after 2.5 steps [s] without a row, and the function that inserts the gaps into a column. */
+function withGaps(time, step) {
 	const at = [];
-	data.time_s.forEach((t, i) => { if (i && t - data.time_s[i - 1] > 2.5 * data.step_s) at.push(-1); at.push(i); });
-	const pick = (name) => at.map((i) => data[name][i] ?? null), no = nulls(at);
+	time.forEach((t, i) => { if (i && t - time[i - 1] > 2.5 * step) at.push(-1); at.push(i); });
+	return [at.map((i, n) => (i < 0 ? time[at[n - 1]] + step : time[i])), (column) => at.map((i) => column[i] ?? null)];
+}
+
+/** Columns of a history. */
+function pastColumns(data) {
+	const [time, insert] = withGaps(data.time_s, data.step_s), pick = (name) => insert(data[name]), no = nulls(time);
 	const span = (name, unit) => [pick(`${name}_max_${unit}`), pick(`${name}_min_${unit}`), pick(`${name}_${unit}`)];
-	const time = at.map((i, n) => (i < 0 ? data.time_s[at[n - 1]] + data.step_s : data.time_s[i]));
 	return { time, v: [...span("voltage", "v"), no], i: span("current", "a"), soc: socColumns(pick("soc"), pick("soc_std")), temp: [no, no, pick("temperature_c")] };
 }
 

@@ -37,7 +37,7 @@ function draw() {
 	const capacity = pack.topics.parameters?.state_of_health?.capacity;
 	drawState(state, capacity);
 	drawForecastValues(state);
-	drawCells(state);
+	drawCells(state, pack.topics.cells);
 	drawRanks(pack.topics.cells, capacity);
 	drawParameters(pack.topics.parameters);
 	drawHealth(pack);
@@ -93,16 +93,23 @@ function drawHead(pack) {
 	}
 }
 
+/** Draw raised alarms, and those that cannot be watched: one row for each reason, none for a reason that a raised alarm states. */
 function drawAlarms({ alarms, topics }) {
-	const active = alarms.filter((a) => a.active || (a.watched === false && topics.health?.sensor_online !== false));
-	active.sort((a, b) => (a.severity < b.severity ? -1 : 1));
-	if (changed($("alarms"), JSON.stringify(active))) $("alarms").replaceChildren(...active.map(alarmRow));
+	const rows = alarms.filter((a) => a.active).map((a) => ({ ...a, names: [a.name] })), raised = rows.map((a) => a.text);
+	for (const a of alarms.filter((b) => !b.active && b.watched === false && topics.health?.sensor_online !== false)) {
+		if (raised.some((why) => why.includes(a.unwatched_reason))) continue;
+		const same = rows.find((row) => !row.active && row.severity === a.severity && row.unwatched_reason === a.unwatched_reason);
+		if (same) same.names.push(a.name);
+		else rows.push({ ...a, names: [a.name] });
+	}
+	rows.sort((a, b) => (a.severity < b.severity ? -1 : 1));
+	if (changed($("alarms"), JSON.stringify(rows))) $("alarms").replaceChildren(...rows.map(alarmRow));
 }
 
 function alarmRow(a) {
 	const facts = [a.severity, a.since && `since ${f.when(new Date(a.since))}`, a.latched && "latched", a.watched === false && "cannot be watched", a.unknown_reason];
-	return node("div", { class: `alarm ${a.severity}`, "data-alarm": a.name },
-		node("b", {}, f.words(a.name)), node("span", {}, a.text || a.unwatched_reason), node("small", {}, facts.filter(Boolean).join(" · ")));
+	return node("div", { class: `alarm ${a.severity}`, "data-alarm": a.names.join(" ") },
+		node("b", {}, f.words(a.names.join(", "))), node("span", {}, a.text || a.unwatched_reason), node("small", {}, facts.filter(Boolean).join(" · ")));
 }
 
 function describe(pack) {

@@ -24,6 +24,7 @@ url = "{url}"
 topic = "bms"
 voltage = "v"
 current = "i"
+interval_s = 0.5
 [mqtt]
 url = "{url}"
 [state]
@@ -97,3 +98,11 @@ def test_settings_that_only_root_can_read_need_sudo(tmp_path: Path, monkeypatch:
     finding = as_nobody(lambda: load_examined_settings(Path("pack.toml")))
     assert isinstance(finding, Finding)
     assert finding.remedy == f"sudo {Path(sys.executable).parent}/bms-estimator doctor pack.toml"
+
+
+def test_a_long_wait_for_a_sample_is_announced(
+    capsys: pytest.CaptureFixture[str], pack: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bms_estimator.cli.settings.doctor.FIRST_SAMPLE_S", 0.5)
+    code, _, err = run(capsys, "doctor", pack)
+    assert (code, err) == (1, "waiting up to 1 s for a sample of the device\n")
