@@ -14,7 +14,7 @@ from pathlib import Path
 
 from bms_estimator.doctor.broker_check import check_broker
 from bms_estimator.doctor.device_check import CELLS_TIMEOUT_S, check_device, first_sample_timeout_s
-from bms_estimator.doctor.finding import Finding, ExaminedPack, fault, ok, warning
+from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
 from bms_estimator.doctor.kernel_check import check_kernels
 from bms_estimator.doctor.port_check import check_port
 from bms_estimator.doctor.service_check import check_service
@@ -175,7 +175,11 @@ def examine(subject: ExaminedPack | None) -> Iterator[Finding]:
         pack_checks = [
             Check("settings", partial(check_settings, subject)),
             Check("port", partial(check_port, subject)),
-            Check("device", partial(check_device, subject), first_sample_timeout_s(subject.settings) + CELLS_TIMEOUT_S + CLOSING_S),
+            Check(
+                "device",
+                partial(check_device, subject),
+                first_sample_timeout_s(subject.settings) + CELLS_TIMEOUT_S + CLOSING_S,
+            ),
             Check("broker", partial(check_broker, subject), BROKER_TIMEOUT_S),
             Check("service", partial(check_service, subject)),
             Check("state folder", partial(check_disk, subject)),

@@ -253,7 +253,7 @@ class Publisher:
 
     def _make_estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         # only saved values are published, so that the next run continues from the published ones
-        self._flow = self._flow.at_least(self._status.saved_flow or self._totals.flow)
+        self._flow = self._flow.at_least(self._status.saved_flow or self._totals.charge_energy)
         capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:

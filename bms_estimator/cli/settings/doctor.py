@@ -18,7 +18,7 @@ from bms_estimator.cli.options.capture_options import AsJson
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.cli.options.table import silenced_log
-from bms_estimator.doctor.device_check import FIRST_SAMPLE_S, first_sample_s, load_decoder
+from bms_estimator.doctor.device_check import MIN_FIRST_SAMPLE_TIMEOUT_S, first_sample_timeout_s, load_decoder
 from bms_estimator.doctor.examine import examine
 from bms_estimator.doctor.finding import ExaminedPack, Finding, Level, fault
 from bms_estimator.doctor.systemd_unit import unit_of
@@ -76,7 +76,7 @@ def _examine(path: Path) -> Iterator[Finding]:
     else:
         with progress_bar("loading the decoder"):
             load_decoder(subject)
-        if not subject.is_running and (wait_s := first_sample_s(subject.settings)) > FIRST_SAMPLE_S:
+        if not subject.is_running and (wait_s := first_sample_timeout_s(subject.settings)) > MIN_FIRST_SAMPLE_TIMEOUT_S:
             typer.echo(f"waiting up to {wait_s:g} s for a sample of the device", err=True)
         yield from examine(subject)
 
