@@ -40,7 +40,7 @@ class PackAlarms:
     def __init__(self, record: NDArray[np.void]) -> None:
         self._alarms, self._estimator = record["alarms"], record["estimator"]
         self._states: NDArray[np.void] = self._alarms[0]["states"]
-        self._evaluation = Evaluation()
+        self._kernel = Evaluation()
         self._samples: SampleBlock = np.zeros(0, SAMPLE)  # last samples of the block
         self._impossible: list[str] = []  # descriptions of impossible values in ``_samples``
         self._has_events = False  # True if the block has changed the estimator in a way that is an event
@@ -55,7 +55,7 @@ class PackAlarms:
         """
         if is_new_time_base:
             begin_time_base(self._alarms)
-        self._evaluation.clear()
+        self._kernel.clear()
         self._has_events = False
         self._cell_windows = int(pack_type.cells.bank["windows"][0])
         self._fits = pack_type.pack.slow_fit.changes if pack_type.pack.slow_fit else 0
@@ -72,12 +72,10 @@ class PackAlarms:
             trace: Their estimates.
             wall_offset_s: Wall clock of the edge minus the samples' clock [s].
         """
-        part, slow_fit = self._evaluation.part[0], pack_type.pack.slow_fit
+        part, slow_fit = self._kernel.part[0], pack_type.pack.slow_fit
         part["wall_offset_s"], part["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
         part["cells_at_s"], part["short_a"], part["reading_v"] = self._cell_values(pack_type)
-        self._has_events |= self._evaluation.run(
-            self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace
-        )
+        self._has_events |= self._kernel.run(self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace)
         self._samples = samples
         self._impossible = [
             pack_type.alarms.bounds.describe(
@@ -117,7 +115,7 @@ class PackAlarms:
             include_unchanged: True to include the raised and unwatched alarms that the block has not changed.
         """
         slow_fit = pack_type.pack.slow_fit
-        entries = self._evaluation.entries
+        entries = self._kernel.entries
         if not (entries.size or self._has_events or include_unchanged or (slow_fit and slow_fit.changes > self._fits)):
             return ()
         positions = set(entries["alarm"].tolist())
@@ -130,7 +128,7 @@ class PackAlarms:
     def _messages_of(self, k: int, pack_type: PackType, trace: TraceBlock, now_s: float) -> Iterator[AlarmMessage]:
         """Yield the events of alarm ``k`` in this block, and its state; two states if it was raised and has ended."""
         state, definition = self._states[k], pack_type.alarms.by_position[k]
-        entries = self._evaluation.entries
+        entries = self._kernel.entries
         changes = {int(entry["kind"]): entry for entry in entries[entries["alarm"] == k]}  # the last one of each kind
         lost = lost_quantities(self._alarms[0])
         missing = [

@@ -29,7 +29,7 @@ from bms_estimator.pack_model.slow_fit import ADOPT_DELAY_S, fit_interval
 MAX_CACHED_CURVES = 4096
 """Maximum number of packs of a partition whose curves are cached, 13 kB each. Other curves are computed for each block."""
 FULL_ROWS = COMPLETED_ROWS - FREE_ROWS
-"""Number of completed rows at which the kernel returns, so that they are sent."""
+"""Number of completed rows at which the kernel returns, so that they are taken."""
 
 
 class PackFits:
