@@ -152,10 +152,10 @@ async def backfill(options: Options, paths: list[Path], stop: asyncio.Event) -> 
     """
     files = parquet_files(paths)
     reader = BatchReader(options.column_map, options.current_sign)
-    async with open_ingest(options, stop) as started:
-        if started is None:
+    async with open_ingest(options, stop) as resources:
+        if resources is None:
             return "stopped before the server responded"
-        _, store, bucket = started
+        _, store, bucket = resources
         history = read_history(files, reader, options.folder)
         sender = Backfill(store, bucket, stop)
         try:

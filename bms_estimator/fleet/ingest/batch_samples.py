@@ -170,10 +170,10 @@ def select_new(batch: BatchSamples, last_s: float, now_s: float) -> Selection:
     order = order[np.argsort(times[order], kind="stable")]
     is_new = np.diff(times[order], prepend=last_s) > 0.0
     is_new &= times[order] > last_s
-    chosen = order[is_new]
-    cells_v = batch.cells_v[chosen] if batch.cells_v.size else NO_CELLS
+    new_rows = order[is_new]
+    cells_v = batch.cells_v[new_rows] if batch.cells_v.size else NO_CELLS
     implausible = times.size - order.size
-    return Selection(batch.samples[chosen], cells_v, order.size - chosen.size, implausible)
+    return Selection(batch.samples[new_rows], cells_v, order.size - new_rows.size, implausible)
 
 
 def drop_reason(old: int, implausible: int, last_s: float) -> str:

@@ -112,9 +112,9 @@ async def ingest(options: Options, stop: asyncio.Event) -> None:
     Raises:
         UserError: An option cannot be used, or another process uses the folder.
     """
-    async with open_ingest(options, stop) as started:
-        if started is not None:
-            nc, store, bucket = started
+    async with open_ingest(options, stop) as resources:
+        if resources is not None:
+            nc, store, bucket = resources
             reader = BatchReader(options.column_map, options.current_sign)
             notifier = SystemdNotifier([NAME], activity="running")
             await Ingest(nc, store, bucket, reader, notifier, options.buffer_bytes).run(stop)

@@ -45,17 +45,17 @@ class BucketReader:
         is_new_bucket = info.created != self._created or info.state.last_seq + 1 < self._next_sequence
         is_purged = not is_new_bucket and info.state.messages < len(self._keys)
         first = 1 if is_new_bucket or is_purged else self._next_sequence
-        found, last = set[str](), first - 1
+        read_keys, last = set[str](), first - 1
         async for batch in read_stream(self._nc, stream_of(self._bucket), subject_of(self._bucket, ">"), first=first):
             for message in batch:
                 key, data = parse_entry(self._bucket, message)
-                found.add(key)
+                read_keys.add(key)
                 set_value(key, data)
             last = batch[-1].sequence
-        for key in self._keys - found if is_purged else ():
+        for key in self._keys - read_keys if is_purged else ():
             set_value(key, None)
-        self.lost = (self.lost | self._keys if is_new_bucket else self.lost) - found
-        self._keys = found if first == 1 else self._keys | found
+        self.lost = (self.lost | self._keys if is_new_bucket else self.lost) - read_keys
+        self._keys = read_keys if first == 1 else self._keys | read_keys
         self._next_sequence, self._created = last + 1, info.created
 
 

@@ -158,17 +158,17 @@ class _Reader:
             raise _RowError(_error_text("pack", name, "must be 1 to 64 letters, digits, _ and -"))
         key = (*values[:index], *values[index + 1 :])
         if key not in self._specs:
-            filled = {
+            nonempty = {
                 column: value for column, value in zip(columns, values, strict=True) if value and column != "pack"
             }
-            spec = self._spec(filled)
+            spec = self._spec(nonempty)
             self._specs[key] = spec, encode_row(spec)
         return name, *self._specs[key]
 
-    def _spec(self, filled: Mapping[str, str]) -> PackSpec:
-        """Return the specification in the filled columns."""
-        values: dict[str, object] = {column: _value(column, value) for column, value in filled.items()}
-        cell = filled.get("cell", "")
+    def _spec(self, nonempty: Mapping[str, str]) -> PackSpec:
+        """Return the specification in the nonempty columns."""
+        values: dict[str, object] = {column: _value(column, value) for column, value in nonempty.items()}
+        cell = nonempty.get("cell", "")
         if cell.endswith(CELL_FILE_SUFFIX):
             values["cell"] = self._cell_file(cell)
         try:
@@ -180,9 +180,9 @@ class _Reader:
                 raise _RowError(f"column {message}") from None
             column = str(detail["loc"][0])
             description = PackSpec.model_fields[column].description
-            if column not in filled:
+            if column not in nonempty:
                 raise _RowError(f"column {column} is empty; it must be {description}") from None
-            raise _RowError(_error_text(column, filled[column], f"{message} ({description})")) from None
+            raise _RowError(_error_text(column, nonempty[column], f"{message} ({description})")) from None
 
     def _cell_file(self, value: str) -> str:
         """Check the file of a cell and return the cell's name."""

@@ -99,12 +99,12 @@ class PackRegistry:
 
     def packs_using(self, cells: Collection[str]) -> set[str]:
         """Return the packs that use one of ``cells``."""
-        found = set[str]()
+        packs = set[str]()
         for pack, data in self.rows.items() if cells else ():
             spec = self._parse(data)
             if not isinstance(spec, str) and spec.cell in cells:
-                found.add(pack)
-        return found
+                packs.add(pack)
+        return packs
 
     def _look_up(self, pack: str) -> tuple[Settings, PackModel] | str:
         """Return settings and model of a pack, or the reason for which it is unknown."""

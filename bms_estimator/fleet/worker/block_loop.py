@@ -58,7 +58,7 @@ class BlockLoop:
             queue = next(iter(self._ready))
             del self._ready[queue]
             if queue.process_next():
-                self._ready[queue] = None  # after the other partitions
+                self._ready[queue] = None  # after the others
             served.add(queue)
         return served
 

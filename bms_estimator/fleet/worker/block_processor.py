@@ -274,9 +274,7 @@ class BlockProcessor:
         delivery, times_s = self._delivery, _finite_times_s(block.samples)
         if not delivery[LAST_STORE_NS] or not times_s.size:
             return math.inf
-        gap_s = (block.store_created_ns - int(delivery[LAST_STORE_NS])) / 1e9 + (
-            float(times_s[0]) - float(delivery["last_s"])
-        )
+        gap_s = (block.store_created_ns - int(delivery[LAST_STORE_NS])) / 1e9 + float(times_s[0] - delivery["last_s"])
         return gap_s if gap_s >= 0.0 else math.inf
 
     def _roll_over_hour(

@@ -81,8 +81,8 @@ def _run_counts(lease: PartitionLease) -> Counter[str]:
 def _event_counts(lease: PartitionLease) -> Counter[str]:
     if lease.partition is None:
         return Counter()
-    counted = Counter(lease.partition.counters) - Counter(lease.restored_counters)
-    return Counter({name: count for name, count in counted.items() if name not in NOT_EVENTS})
+    new_counters = Counter(lease.partition.counters) - Counter(lease.restored_counters)
+    return Counter({name: count for name, count in new_counters.items() if name not in NOT_EVENTS})
 
 
 MAX_RELEASES = 8

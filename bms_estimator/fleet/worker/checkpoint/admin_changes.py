@@ -109,20 +109,20 @@ async def restore_day(
         UserError: No partition has a checkpoint of the day, or one is damaged or of a version that this one cannot read.
     """
     pointers = await read_pointers(nc)
-    chosen = {
+    daily_checkpoints = {
         number: info
         for number, pointer in pointers.items()
         for info in pointer.daily
         if day_of(info) == day and (not partitions or number in partitions)
     }
-    if not chosen:
+    if not daily_checkpoints:
         days = sorted({day_of(info) for pointer in pointers.values() for info in pointer.daily})
         raise UserError(f"{day}: no checkpoint of this day; there are those of {', '.join(map(str, days)) or 'no day'}")
     store = await open_checkpoints(nc, RESTORE_NAME)
     last = (await nc.jetstream().stream_info(subjects.RAW_STREAM)).state.last_seq if skip_blocks else None
-    for number, info in chosen.items():
+    for number, info in daily_checkpoints.items():
         await change_checkpoints(nc, number, partial(_restore, store, number, info, last))
-    return chosen
+    return daily_checkpoints
 
 
 async def _restore(store: CheckpointStore, number: int, info: CheckpointInfo, last_sequence: int | None) -> None:
@@ -258,12 +258,12 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
             continue
         readable.add(info)
         by_pack = _fields_by_pack(checkpoint)
-        found = {pack for pack in counts if any(pack in part for part in by_pack.values())}
-        if found or store.is_damaged(info):  # a damaged increment may contain the packs
-            parts: dict[str, Any] = {name: _without(part, found) for name, part in by_pack.items()}
+        erased = {pack for pack in counts if any(pack in part for part in by_pack.values())}
+        if erased or store.is_damaged(info):  # a damaged increment may contain the packs
+            parts: dict[str, Any] = {name: _without(part, erased) for name, part in by_pack.items()}
             rest = replace(checkpoint, **parts)
             claim = await store.replace(claim, info, rest.chunks(info.format))
-        for pack in found:
+        for pack in erased:
             counts[pack] += 1
     for info in checkpoints:
         if info not in readable:  # an unreadable checkpoint may contain the packs

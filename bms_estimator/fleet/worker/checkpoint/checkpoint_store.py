@@ -121,8 +121,8 @@ class CheckpointStore:
             return await self.claims.write(partition, 0, CheckpointPointer())  # revision 0: the key must not exist
         # listed before the claim, because the next owner may write objects after it
         objects = await self._objects.names(partition)
-        counted = stored.pointer.model_copy(update={"unsaved_claims": stored.pointer.unsaved_claims + 1})
-        claim = await self.claims.write(partition, stored.revision, counted)
+        new_pointer = stored.pointer.model_copy(update={"unsaved_claims": stored.pointer.unsaved_claims + 1})
+        claim = await self.claims.write(partition, stored.revision, new_pointer)
         for name in (objects | {stored.pointer.next}) - claim.pointer.objects:
             await self._objects.remove(name)
         return claim
