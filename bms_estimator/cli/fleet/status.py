@@ -36,7 +36,7 @@ def status(
 ) -> None:
     """List the workers with their versions, and what needs attention.
 
-    Listed are errors of workers, refused partitions, unknown packs that send blocks, packs with dead letters, and packs whose edge's
+    The output lists errors of workers, refused partitions, unknown packs that send blocks, packs with dead letters, and packs whose edge's
     clock is wrong. A warning follows if more than half of the stream is filled by blocks that no checkpoint includes.
     """
     heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
