@@ -80,7 +80,6 @@ def _day_rows(pointers: "Iterable[CheckpointPointer]") -> list[tuple[object, ...
 
 
 def _rows(pointer: "CheckpointPointer") -> list[tuple[object, ...]]:
-    """Return a row for each checkpoint of a partition."""
     kinds = [*zip(("last", "previous"), pointer.kept, strict=False), *(("daily", info) for info in pointer.daily)]
     return [
         (

@@ -73,7 +73,6 @@ def _unknown_packs(heartbeat: "Heartbeat") -> list[str]:
 
 
 def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
-    """Return a line for each listed pack with dead letters."""
     lines = [
         f"{pack}: dead letter: {reason}; `fleet dead-letters list` lists all" for pack, reason in dead_packs.reasons
     ]
