@@ -150,7 +150,7 @@ def c_header(cell: CellModel) -> str:
 def _thinned_ocv(cell: CellModel) -> OcvTable:
     """Return the OCV at the fewest nodes between which linear interpolation is within ``INTERPOLATION_ERROR_V``.
 
-    The table of the cell file is interpolated by a cubic curve, which firmware need not evaluate.
+    The table of the cell file is interpolated by a cubic curve. Between these nodes, firmware can interpolate linearly.
     """
     table, soc, grid = ocv_table(cell), np.linspace(0.0, 1.0, FINE_POINTS), ocv_grid(cell)
     curve = OcvTable(

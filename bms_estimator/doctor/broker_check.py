@@ -1,8 +1,8 @@
 """Check of the MQTT brokers: connection, and permission to publish and read the pack's topics.
 
 The only message that is published is ``offline``, not retained, on the pack's availability topic, and only while no service
-of the pack is online. A test of other topics would send false values to their subscribers. A running service reports denied
-topics itself, in its health, and whether samples arrive from its device.
+of the pack is online. A test of other topics would send false values to their subscribers. The health message
+of a running service reports denied topics and missing samples.
 """
 
 import asyncio

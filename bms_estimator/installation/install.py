@@ -227,7 +227,6 @@ def _set_settings_group(machine: Machine, group: int) -> None:
 
 
 def _is_enabled(machine: Machine) -> bool:
-    """Return True if the service starts with the machine."""
     folders = machine.path(paths.UNIT).parent.glob("*.wants")
     return any((folder / paths.UNIT.name).is_symlink() for folder in folders)
 

@@ -74,10 +74,7 @@ def _as_toml(value: object) -> str:
 
 
 def _default_as_toml(field: FieldInfo) -> str:
-    """Return the default as TOML.
-
-    A required field has no default: a literal gives its first choice, any other field an empty text.
-    """
+    """Return the default as TOML; for a required field the first choice of a literal, otherwise an empty text."""
     if get_origin(field.annotation) is Literal and field.is_required():
         return f'"{get_args(field.annotation)[0]}"'
     default = None if field.is_required() else field.get_default(call_default_factory=True)

@@ -257,7 +257,6 @@ def _table(out: Path, result: OcvResult, ocv_sources: OcvSources) -> Table:
 
 
 def _sources_table(result: OcvResult) -> Table:
-    """Return a table with the recognized kind of each source."""
     table = Table("source", "recognized as", "°C", "RMS error", "hysteresis", box=box.SIMPLE_HEAD)
     for source in result.sources:
         table.add_row(

@@ -60,7 +60,7 @@ def restore(
 ) -> None:
     """Reset all packs of the chosen partitions to the first checkpoint of a day.
 
-    The workers then process the later blocks that are still in the stream again. If wrong samples have spoiled the states, use
+    The workers then process again the later blocks that are still in the stream. If wrong samples have spoiled the states, use
     --skip-blocks.
     """
     chosen = asyncio.run(_restore((server, creds, ca), day.date(), frozenset(partition or ()), skip_blocks=skip_blocks))
@@ -80,7 +80,6 @@ def _day_rows(pointers: "Iterable[CheckpointPointer]") -> list[tuple[object, ...
 
 
 def _rows(pointer: "CheckpointPointer") -> list[tuple[object, ...]]:
-    """Return a row for each checkpoint of a partition."""
     kinds = [*zip(("last", "previous"), pointer.kept, strict=False), *(("daily", info) for info in pointer.daily)]
     return [
         (

@@ -31,9 +31,9 @@ def demo(
 ) -> None:
     """Run a server, simulated packs, two workers and the fleet's page in one terminal for a minute.
 
-    The output explains each step. Three packs send faulty data, which the fleet must name.
+    The output explains each step. Three packs send faulty data, which the fleet must detect.
     One of the two workers is killed, and the other takes over its packs.
-    The end is a table of measured results.
+    The output ends with a table of measured results.
     All parts are processes on the loopback interface, with free ports and a temporary folder.
     """
     compile_ahead()

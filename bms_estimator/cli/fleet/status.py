@@ -36,7 +36,7 @@ def status(
 ) -> None:
     """List the workers with their versions, and what needs attention.
 
-    Listed are errors of workers, refused partitions, unknown packs that send blocks, packs with dead letters, and packs whose edge's
+    The output lists errors of workers, refused partitions, unknown packs that send blocks, packs with dead letters, and packs whose edge's
     clock is wrong. A warning follows if more than half of the stream is filled by blocks that no checkpoint includes.
     """
     heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
@@ -73,7 +73,6 @@ def _unknown_packs(heartbeat: "Heartbeat") -> list[str]:
 
 
 def _dead_letters(dead_packs: "DeadPacks") -> list[str]:
-    """Return a line for each listed pack with dead letters."""
     lines = [
         f"{pack}: dead letter: {reason}; `fleet dead-letters list` lists all" for pack, reason in dead_packs.reasons
     ]

@@ -25,7 +25,7 @@ of 16 mV, the step between the plateaus. On three parts of a capture 1.6 % above
 def load_pack(path: Path) -> tuple[Settings, PackModel]:
     """Load a pack's settings and the model of the whole pack.
 
-    A cell file is searched in the folder of the pack file first, then in the working directory.
+    The cell file is searched for in the folder of the pack file first, then in the working directory.
 
     Raises:
         UserError: The file cannot be read, a setting is invalid, or the cell is unknown.
@@ -37,7 +37,7 @@ def load_pack(path: Path) -> tuple[Settings, PackModel]:
 def single_cell_of(path: Path, settings: Settings) -> CellModel:
     """Return the model of one cell of a pack, before it is scaled to the cells in series and parallel.
 
-    The cell file is searched as in ``load_pack``.
+    The cell file is searched for as in ``load_pack``.
     """
     return load_cell(_locate_cell(path, settings.pack.cell), settings.pack.capacity_ah)
 

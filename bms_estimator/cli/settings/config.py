@@ -26,7 +26,7 @@ PackFile = Annotated[Path, typer.Argument(help="settings file of the pack")]
 def init(file: PackFile = Path("pack.toml")) -> None:
     """Write a settings file that lists every setting with its meaning, unit and default.
 
-    `bms-estimator new` also searches the device, and asks for the values of the pack.
+    `bms-estimator new` also searches for the device, and asks for the values of the pack.
     """
     create_pack_file(file)
     typer.echo(f"{file}: written; edit it, then: bms-estimator config check {file}")
