@@ -95,19 +95,16 @@ def discovery(
         device["serial_number"] = info.board["serial"]
     fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
     expiry_s = max(MIN_EXPIRY_S, math.ceil(fresh_s))
-    positive_direction = settings.current_sign.removesuffix("_positive")
     sensors = entities(info, inputs.cells).items()
+    positive = {"positive": settings.current_sign.removesuffix("_positive")}
+    templates = {"soc_percent": _SOC_HINT} | {key: _constant(positive) for key, entity in sensors if entity.signed}
+    for direction, limit_a in (("discharge", info.max_discharge_a), ("charge", info.max_charge_a)):
+        assumed = {"hint": f"current limit assumed: max_{direction}_a is not in [pack]"}
+        keys = (f"available_{direction}_power_{duration}_w" for duration in ("10s", "60s"))
+        templates |= dict.fromkeys(keys, _constant(assumed)) if limit_a is None else {}
     components = {
-        **{key: _sensor(key, entity, root, expiry_s) for key, entity in sensors},
         **{
-            key: _sensor(key, entity, root, expiry_s) | _current_sign_attribute(root, positive_direction)
-            for key, entity in sensors
-            if entity.signed
-        },
-        **{
-            key: _sensor(key, entity, root, expiry_s) | _attributes(root, _SOC_HINT)
-            for key, entity in sensors
-            if key == "soc_percent"
+            key: _sensor(key, entity, root, expiry_s) | _attributes(root, templates.get(key)) for key, entity in sensors
         },
         **{f"alarm_{name}": _alarm(name, root) for name in inputs.alarms},
         **{name: _COMMANDS[name](root) for name in inputs.commands},
@@ -175,14 +172,14 @@ def _sensor(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
     return {option: value for option, value in options.items() if value is not None}
 
 
-def _current_sign_attribute(root: str, positive_direction: str) -> dict[str, str]:
-    """Return the attribute with the direction of positive current."""
-    template = f"{{{{ {{'positive': '{positive_direction}'}} | tojson }}}}"
-    return _attributes(root, template)
+def _constant(attributes: dict[str, str]) -> str:
+    """Return the template of constant attributes."""
+    return f"{{{{ {attributes} | tojson }}}}"
 
 
-def _attributes(root: str, template: str) -> dict[str, str]:
-    return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
+def _attributes(root: str, template: str | None) -> dict[str, str]:
+    """Return the options of attributes by a template; None: an entity without attributes."""
+    return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template} if template else {}
 
 
 def _alarm(name: str, root: str) -> dict[str, Any]:
