@@ -95,15 +95,15 @@ def _alarm_events(before: Snapshot | None, snapshot: Snapshot) -> Iterator[Event
     the start are skipped, because the previous run reported them.
     """
     previous = {alarm.name: alarm for alarm in before.alarms} if before else {}
-    previous_since = {name: alarm.since for name, alarm in previous.items()}
     for alarm in snapshot.alarms:
-        since = previous_since.get(alarm.name)
+        since = previous[alarm.name].since if alarm.name in previous else None
         if since is not None and since != alarm.since:
             yield EventText("alarm_cleared", alarm.name)
         if alarm.since is not None and since != alarm.since and alarm.since >= snapshot.info.started:
             yield EventText("alarm_raised", f"{alarm.name}: {alarm.text}")
-    was_watched = {name: alarm.watched for name, alarm in previous.items()}
-    yield from watch_events(a for a in snapshot.alarms if a.watched != was_watched.get(a.name, True))
+    yield from watch_events(
+        a for a in snapshot.alarms if a.watched == (a.name in previous and not previous[a.name].watched)
+    )
 
 
 def watch_events(alarms: Iterable[Alarm]) -> Iterator[EventText]:

@@ -90,7 +90,7 @@ def _token(settings: PageSettings) -> str | None:
     if len(token) < MIN_TOKEN_CHARACTERS:
         raise TemporaryError(
             f"page.token_file = {name}: the token has {len(token)} letters, must have {MIN_TOKEN_CHARACTERS} or more; "
-            f"`openssl rand -hex 16 > {name}` makes one"
+            f"`openssl rand -hex 16` makes one (docs/pack/page.md)"
         )
     return token
 

@@ -20,6 +20,7 @@ from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import make_cells_payload
 from bms_estimator.telemetry.health import (
+    contradicts_device,
     dropped_text,
     make_health_payload,
     out_of_range_reason,
@@ -98,7 +99,7 @@ class Publisher:
         self._cells_sent_s = -math.inf  # time of the last comparison of the cells, monotonic clock
         self.alarm_monitor = AlarmMonitor(settings, pack, source, clock, on_alarm, self._status.hooks)
         self._short_limit_a = short_limit_a(settings, cell)
-        self._logged_faults = 0  # bits of ``InputFault``
+        self._logged_faults, self._contradiction = (0, False), False  # bits of ``InputFault``, and ``_contradiction``
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
@@ -276,8 +277,10 @@ class Publisher:
 
     def _make_health(self, now_s: float, message: str | None) -> Health:
         lag_s, self._lag_s, status, slow_fit = self._lag_s, 0.0, self._status, self._pack.slow_fit
+        record, device_std = self._estimator.record[0], self._settings.pack.device_soc_std
+        self._contradiction = contradicts_device(record, self._device_soc, device_std, before=self._contradiction)
         return make_health_payload(
-            self._estimator.record[0],
+            record,
             self._estimator.settings_record[0],
             self._source.counters,
             now_s=self._clock.wall(),
@@ -295,11 +298,12 @@ class Publisher:
             edge=status.edge(),
             hooks=status.hooks(),
             pack_model=pack_model_health(slow_fit, status.fit_times()) if slow_fit else None,
+            contradicts_device=self._contradiction,
         )
 
     def _log_input_faults(self, health: Health) -> None:
         """Log the suspected input faults when their set changes; the numbers in their texts change more often."""
-        suspects = int(self._estimator.record["checks"]["suspects"][0])
+        suspects = int(self._estimator.record["checks"]["suspects"][0]), self._contradiction
         if suspects != self._logged_faults:
             self._logged_faults = suspects
             log.warning("suspected input faults", suspects=health.suspects or "none")

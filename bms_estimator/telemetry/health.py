@@ -30,6 +30,15 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.history import DAY_S
 from bms_estimator.pack_model.slow_fit import SlowFit
 
+CONTRADICTION_STD, AGREEMENT_STD = 3.0, 2.0
+"""Difference between the estimate and the SOC by the device above which ``DEVICE_SOC`` is suspected, and below which it is no longer
+suspected, in standard deviations of the difference."""
+DEVICE_SOC = (
+    "the SOC that the device reports contradicts the voltage: check that the OCV curve belongs to this cell's chemistry, the number of "
+    "cells in series and the sign of the current; a device that counts charge is also wrong long after its last full charge"
+)
+"""Suspicion of the chemistry, by the SOC of the device."""
+
 
 class FitTimes(NamedTuple):
     """End of the last fit [s since 1970] and its duration [s]; None before the first."""
@@ -151,6 +160,21 @@ def suspicions(record: np.void, settings: np.void) -> list[str]:
     return list(texts.values())
 
 
+def contradicts_device(record: np.void, device_soc: float | None, device_std: float | None, *, before: bool) -> bool:
+    """Return True if the estimate contradicts the SOC that the device reports, whose std the settings declare.
+
+    Args:
+        record: Record of dtype ESTIMATOR_STATE.
+        device_soc: SOC by the device, 0..1; None: not reported.
+        device_std: Standard deviation of ``device_soc``; None: not declared.
+        before: Previous result.
+    """
+    if device_soc is None or device_std is None or not record["filter"]["started"]:
+        return False
+    limit = (AGREEMENT_STD if before else CONTRADICTION_STD) * math.hypot(device_std, record["filter"]["soc_std"])
+    return bool(abs(record["observer"]["soc"] - device_soc) > limit)
+
+
 def make_health_payload(
     record: np.void,
     settings: np.void,
@@ -171,6 +195,7 @@ def make_health_payload(
     edge: EdgeHealth | None = None,
     hooks: HookHealth | None = None,
     pack_model: PackModelHealth | None = None,
+    contradicts_device: bool = False,
 ) -> Health:
     """Return the payload of topic ``health``.
 
@@ -192,7 +217,8 @@ def make_health_payload(
         recording: State of the recording; None: nothing is recorded.
         edge: State of the fleet edge; None without an edge.
         hooks: Successes and failures of alarm hooks; None without hooks.
-        pack_model: State of the slow fit; None without a slow fit.
+            pack_model: State of the slow fit; None without a slow fit.
+        contradicts_device: True: ``DEVICE_SOC`` is suspected.
     """
     state = record["observer"]
     return Health(
@@ -208,7 +234,7 @@ def make_health_payload(
         line={name: int(count) for name, count in source_counters.items() if name != "reconnects"},
         samples=sample_counters(state),
         identifier=identifier_counters(record),
-        suspects=suspicions(record, settings),
+        suspects=suspicions(record, settings) + [DEVICE_SOC] * contradicts_device,
         anchor=last_anchor(record),
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),

@@ -279,6 +279,8 @@ def make_info_payload(
         capacity_ah=pack.capacity_ah,
         series_count=pack.cell.series_count,
         nominal_voltage_v=pack.cell.nominal_voltage_v,
+        max_discharge_a=settings.pack.max_discharge_a,
+        max_charge_a=settings.pack.max_charge_a,
         observer="learning" if learns else f"{settings.observer.law}, {settings.observer.nussbaum}",
         temperature_sensor=temperature_sensor,
         publish_rate_hz=settings.publish.rate_hz,

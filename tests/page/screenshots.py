@@ -46,12 +46,22 @@ STEP_S, LIVE_S = 60.0, 600.0
 """Interval of the samples, and duration at the end with a sample each second, which the live curves show [s]."""
 Parts = tuple[NDArray[np.void], NDArray[np.float64], NDArray[np.float64]]
 """Samples, cell voltages [V], and SOC of the BMS."""
-FULL_V = 3.42
-"""Voltage of a cell above which the charger reduces its current [V]."""
+FULL_V, TAIL_A = 3.41, 14.0
+"""Voltage of a cell above which the charger reduces its current [V], and current at which it ends the charge [A]."""
 TOP_PX = 500
 """Height of the upper part of the page, with alarms or the note about stale values [px]."""
 SETTINGS: dict[str, Any] = {
-    "pack": {"name": "home", "cell": "lfp", "capacity_ah": CAPACITY_AH, "series": CELLS, "device_soc_std": 0.1},
+    "pack": {
+        "name": "home",
+        "cell": "lfp",
+        "capacity_ah": CAPACITY_AH,
+        "series": CELLS,
+        "device_soc_std": 0.1,
+        "full_voltage_v": CELLS * (FULL_V - 0.02),
+        "tail_current_a": TAIL_A,
+        "max_discharge_a": 200.0,
+        "max_charge_a": 140.0,
+    },
     "identifier": {"fit_interval_s": 86_400},
     "sensor": {"protocol": "text", "voltage_resolution_v": 0.01, "current_resolution_a": 0.01},
 }
@@ -69,7 +79,7 @@ class House:
 
     def __init__(self, days: float, soc: float, hour: float, **settings: Any) -> None:
         self.rng = np.random.default_rng(3)
-        cells = BankCells.random(self.rng, CELLS, 0.97 * CAPACITY_AH, soc)
+        cells = BankCells.random(self.rng, CELLS, 0.97 * CAPACITY_AH, soc, capacity_std=0.002, soc_std=0.001)
         self.bank = SimulatedBank(load_cell("lfp", CAPACITY_AH), cells)
         self.settings = Settings.model_validate(SETTINGS | settings)
         self.pack = new_pack(self.settings, load_cell("lfp", CAPACITY_AH).pack(CELLS, 1))
@@ -103,9 +113,7 @@ class House:
     def run(self, step_s: float) -> Parts:
         """Simulate a minute. Return its samples, its cell voltages [V], and the SOC of the BMS."""
         count = round(60.0 / step_s)
-        history = self.bank.run(
-            self.current_a() + 3.0 * self.rng.standard_normal(count) * (self.charger_a < 9.0), step_s
-        )
+        history = self.bank.run(self.current_a() + 0.3 * self.rng.standard_normal(count), step_s)
         self.charger_a *= 0.7 if history.cell_v.max() > FULL_V else 1.0
         samples, soc = history.samples(self.rng, 2e-3, 0.01), float(self.bank.soc.mean())
         cells_v = np.round(history.cell_v + 5e-4 * self.rng.standard_normal(history.cell_v.shape), 3)
@@ -125,7 +133,7 @@ class House:
         if not 8.0 <= hour < 16.0:
             self.charger_a = 70.0
             return 8.0 + 4.0 * float(np.sin(self.time_s / 3000.0))
-        return -self.charger_a if self.charger_a > 4.0 else 0.0
+        return -self.charger_a if self.charger_a > 0.7 * TAIL_A else 0.0
 
 
 async def shoot(page_tab: Tab, name: str, part: str = "", *, top: bool = False) -> None:

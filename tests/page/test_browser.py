@@ -201,6 +201,7 @@ async def test_the_forecast_is_shown_as_curves_and_with_its_band(browser: Browse
         assert {name: await page_tab.text(name) for name in shown} == shown
         await page_tab.until_text("cutoff_within", "0 %, 0 %, 1 %")
         assert await page_tab.text("discharge_power") == "450 W, 420 W"
+        assert await page_tab.text("discharge_limit") == "current limit assumed"
         await publish_state(programs.live, available_discharge_power_10s_w=450.4, available_discharge_power_60s_w=None)
         await page_tab.until_text("discharge_power", f"450 W, {DASH}")
         for chart in ("Voltage, forecast: from 2.700 to 3.800 V", "State of charge, forecast: from 0.000 to 50.000 %"):

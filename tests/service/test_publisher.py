@@ -13,6 +13,7 @@ from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples
+from bms_estimator.telemetry.health import DEVICE_SOC
 from tests.scripted_source import Collector, ScriptedSource
 
 
@@ -38,6 +39,19 @@ def test_suspected_input_faults_are_logged_when_their_set_changes() -> None:
     [[first], *later] = logged_suspects
     assert first.startswith("['no data at 41 C, the cell fi")
     assert later == [[], ["none"], []]
+
+
+@pytest.mark.parametrize(("chemistry", "suspects"), [("nmc", [DEVICE_SOC]), ("lfp", [])])
+def test_a_wrong_chemistry_is_suspected_by_the_soc_of_the_device(chemistry: str, suspects: list[str]) -> None:
+    """The samples are those of an LFP cell at rest for ten minutes, whose device reports 60 %."""
+    settings = Settings.model_validate({"pack": {"cell": chemistry, "capacity_ah": 100.0, "device_soc_std": 0.1}})
+    now_s, samples, device_soc = 0.0, np.zeros(600, SAMPLE), np.full(600, 0.6)
+    pack = new_pack(settings, load_cell(chemistry, 100.0))
+    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[], clock=Clock(monotonic=lambda: now_s))
+    now_s, samples["time_s"], samples["voltage_v"] = 600.0, np.arange(600), 3.3
+    samples["temperature_c"] = 25.0
+    publisher.add(ReceivedSamples(samples, NO_CELLS, device_soc=device_soc), pack.run(samples, device_soc=device_soc))
+    assert publisher.snapshot.health.suspects == suspects
 
 
 def test_a_raised_alarm_is_published_before_the_next_snapshot_is_due() -> None:

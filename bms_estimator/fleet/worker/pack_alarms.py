@@ -75,7 +75,9 @@ class PackAlarms:
         part, slow_fit = self._evaluation.part[0], pack_type.pack.slow_fit
         part["wall_offset_s"], part["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
         part["cells_at_s"], part["short_a"], part["reading_v"] = self._cell_values(pack_type)
-        self._has_events |= self._evaluation.run(self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace)
+        self._has_events |= self._evaluation.run(
+            self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace
+        )
         self._samples = samples
         self._impossible = [
             pack_type.alarms.bounds.describe(

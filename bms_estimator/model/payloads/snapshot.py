@@ -96,6 +96,12 @@ class Info(Payload):
     capacity_ah: float | None = Field(description="rated capacity of the pack [Ah]; null for a fuel cell")
     series_count: int
     nominal_voltage_v: float
+    max_discharge_a: float | None = Field(
+        description="pack.max_discharge_a [A]; null: not configured, so that the available power assumes a limit"
+    )
+    max_charge_a: float | None = Field(
+        description="pack.max_charge_a [A]; null: not configured, so that the available power assumes a limit"
+    )
     observer: str = Field(description="adaptation law, and N(k) for a law of the thesis")
     temperature_sensor: bool = Field(
         description="true: a cell temperature was received; without one 25 C is assumed and the resistances are less certain"

@@ -28,9 +28,11 @@ export function drawForecast({ topics: { forecast: report, state } }) {
 	for (const [name, chart] of Object.entries(charts)) chart.draw([time, ...columns[name]], time[0], time.at(-1));
 }
 
-export function drawForecastValues(s) {
+export function drawForecastValues(s, info) {
 	const both = (name) => ["10s", "60s"].map((time) => f.watts(s[`${name}_${time}_w`]) || "–").join(", ");
 	put("cutoff_within", [2, 5, 15].map((minutes) => `${f.percent(s[`cutoff_within_${minutes}min`], 0)} %`).join(", "));
-	put("discharge_power", both("available_discharge_power"));
-	put("charge_power", both("available_charge_power"));
+	for (const way of ["discharge", "charge"]) {
+		put(`${way}_power`, both(`available_${way}_power`));
+		put(`${way}_limit`, info?.[`max_${way}_a`] === null ? "current limit assumed" : "");
+	}
 }

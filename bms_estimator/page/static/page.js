@@ -36,7 +36,7 @@ function draw() {
 	drawAlarms(pack);
 	const capacity = pack.topics.parameters?.state_of_health?.capacity;
 	drawState(state, capacity);
-	drawForecastValues(state);
+	drawForecastValues(state, pack.topics.info);
 	drawCells(state, pack.topics.cells);
 	drawRanks(pack.topics.cells, capacity);
 	drawParameters(pack.topics.parameters);

@@ -95,22 +95,19 @@ def discovery(
         device["serial_number"] = info.board["serial"]
     fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
     expiry_s = max(MIN_EXPIRY_S, math.ceil(fresh_s))
-    positive_direction = settings.current_sign.removesuffix("_positive")
     sensors = entities(info, inputs.cells).items()
+    positive = {"positive": settings.current_sign.removesuffix("_positive")}
+    templates = {"soc_percent": _SOC_HINT} | {key: _constant(positive) for key, entity in sensors if entity.signed}
+    for direction, limit_a in (("discharge", info.max_discharge_a), ("charge", info.max_charge_a)):
+        assumed = {"hint": f"current limit assumed: max_{direction}_a is not in [pack]"}
+        keys = (f"available_{direction}_power_{duration}_w" for duration in ("10s", "60s"))
+        templates |= dict.fromkeys(keys, _constant(assumed)) if limit_a is None else {}
     components = {
-        **{key: _sensor(key, entity, root, expiry_s) for key, entity in sensors},
         **{
-            key: _sensor(key, entity, root, expiry_s) | _current_sign_attribute(root, positive_direction)
-            for key, entity in sensors
-            if entity.signed
-        },
-        **{
-            key: _sensor(key, entity, root, expiry_s) | _attributes(root, _SOC_HINT)
-            for key, entity in sensors
-            if key == "soc_percent"
+            key: _sensor(key, entity, root, expiry_s) | _attributes(root, templates.get(key)) for key, entity in sensors
         },
         **{f"alarm_{name}": _alarm(name, root) for name in inputs.alarms},
-        **{name: _COMMANDS[name](root) for name in inputs.commands},
+        **{name: control for name, control in _controls(root).items() if name in inputs.commands},
     }
     names = settings.names | _cell_names(settings, inputs.cells)
     return {
@@ -134,7 +131,7 @@ def _removed_components(inputs: DiscoveryInputs) -> dict[str, dict[str, str]]:
     platforms = {f"alarm_{name}": "binary_sensor" for name in inputs.unwatched} | dict.fromkeys(
         FORMER_SENSORS, "sensor"
     )
-    platforms |= {name: control("")["platform"] for name, control in _COMMANDS.items() if name not in inputs.commands}
+    platforms |= {name: control["platform"] for name, control in _controls("").items() if name not in inputs.commands}
     return {key: {"platform": platform} for key, platform in platforms.items()}
 
 
@@ -177,14 +174,14 @@ def _sensor(key: str, entity: Entity, root: str, expiry_s: int) -> dict[str, Any
     return {option: value for option, value in options.items() if value is not None}
 
 
-def _current_sign_attribute(root: str, positive_direction: str) -> dict[str, str]:
-    """Return the attribute with the direction of positive current."""
-    template = f"{{{{ {{'positive': '{positive_direction}'}} | tojson }}}}"
-    return _attributes(root, template)
+def _constant(attributes: dict[str, str]) -> str:
+    """Return the template of constant attributes."""
+    return f"{{{{ {attributes} | tojson }}}}"
 
 
-def _attributes(root: str, template: str) -> dict[str, str]:
-    return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template}
+def _attributes(root: str, template: str | None) -> dict[str, str]:
+    """Return the options of attributes by a template; None: an entity without attributes."""
+    return {"json_attributes_topic": f"{root}/{VALUES}", "json_attributes_template": template} if template else {}
 
 
 def _alarm(name: str, root: str) -> dict[str, Any]:
@@ -203,68 +200,42 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
     }
 
 
-def _set_soc(root: str) -> dict[str, Any]:
-    """Return the control that sets the SOC.
+def _controls(root: str) -> dict[str, dict[str, Any]]:
+    """Return the controls by command.
 
-    The control shows the last set value. The live SOC would add a row to the recorder with each change.
+    That of the SOC shows the last set value, because the live SOC would add a row to the recorder with each change. The button that
+    discards what was learned is disabled, because a press cannot be undone.
     """
-    return {
-        "platform": "number",
-        "name": "Set state of charge",
-        "command_topic": f"{root}/request/set_soc",
-        "command_template": '{"soc": {{ value / 100 }}}',
-        "min": 0,
-        "max": 100,
-        "step": 0.1,
-        "mode": "box",
-        "unit_of_measurement": "%",
-        "entity_category": "config",
+    service = dict[str, Any](availability=[{"topic": f"{root}/availability"}])  # available without a sensor, too
+    config, button = dict[str, Any](entity_category="config"), dict[str, Any](platform="button", payload_press="{}")
+    controls = {
+        "set_soc": config
+        | {
+            "platform": "number",
+            "name": "Set state of charge",
+            "command_template": '{"soc": {{ value / 100 }}}',
+            "min": 0,
+            "max": 100,
+            "step": 0.1,
+            "mode": "box",
+            "unit_of_measurement": "%",
+        },
+        "current_zero": config | button | {"name": "Take present current as zero"},
+        "acknowledge_alarm": service | button | {"name": "Acknowledge alarms"},
+        "publish_rate": service
+        | config
+        | {
+            "platform": "number",
+            "name": "Publish rate",
+            "state_topic": f"{root}/info",
+            "value_template": "{{ value_json.publish_rate_hz }}",
+            "command_template": '{"rate_hz": {{ value }}}',
+            "min": MIN_RATE_HZ,
+            "max": MAX_RATE_HZ,
+            "step": 0.1,
+            "mode": "box",
+            "unit_of_measurement": "Hz",
+        },
+        "forget_pack": service | config | button | {"name": "Forget pack", "enabled_by_default": False},
     }
-
-
-def _current_zero(root: str) -> dict[str, Any]:
-    return _button("Take present current as zero", f"{root}/request/current_zero") | {"entity_category": "config"}
-
-
-def _acknowledge(root: str) -> dict[str, Any]:
-    """Return the button that acknowledges all alarms."""
-    availability = {"availability": [{"topic": f"{root}/availability"}]}
-    return _button("Acknowledge alarms", f"{root}/request/acknowledge_alarm") | availability
-
-
-def _forget_pack(root: str) -> dict[str, Any]:
-    """Return the button that discards what was learned from the pack. It is disabled, because a press cannot be undone."""
-    availability = {"availability": [{"topic": f"{root}/availability"}]}
-    hidden = {"entity_category": "config", "enabled_by_default": False}
-    return _button("Forget pack", f"{root}/request/forget_pack") | availability | hidden
-
-
-def _button(name: str, topic: str) -> dict[str, Any]:
-    return {"platform": "button", "name": name, "command_topic": topic, "payload_press": "{}"}
-
-
-def _publish_rate(root: str) -> dict[str, Any]:
-    return {
-        "platform": "number",
-        "name": "Publish rate",
-        "state_topic": f"{root}/info",
-        "value_template": "{{ value_json.publish_rate_hz }}",
-        "command_topic": f"{root}/request/publish_rate",
-        "command_template": '{"rate_hz": {{ value }}}',
-        "min": MIN_RATE_HZ,
-        "max": MAX_RATE_HZ,
-        "step": 0.1,
-        "mode": "box",
-        "unit_of_measurement": "Hz",
-        "availability": [{"topic": f"{root}/availability"}],
-        "entity_category": "config",
-    }
-
-
-_COMMANDS = {
-    "set_soc": _set_soc,
-    "current_zero": _current_zero,
-    "acknowledge_alarm": _acknowledge,
-    "publish_rate": _publish_rate,
-    "forget_pack": _forget_pack,
-}
+    return {name: {"command_topic": f"{root}/request/{name}"} | control for name, control in controls.items()}

@@ -371,3 +371,11 @@ def test_disabled_discovery_removes_the_device() -> None:
     due, _ = messages.live_messages(PublishedState(), CELL_SNAPSHOT, 0.0)
     discovery_messages = [m for m in due if "home_assistant" in m.topic or not m.topic.startswith("bms/")]
     assert [(m.topic, m.payload, m.retain) for m in discovery_messages] == [("ha/device/bms_pack/config", b"", True)]
+
+
+@pytest.mark.parametrize(("limit_a", "is_marked"), [(None, True), (100.0, False)])
+def test_an_available_power_within_an_assumed_current_limit_is_marked(limit_a: float | None, is_marked: bool) -> None:
+    info = CELL_SNAPSHOT.info.model_copy(update={"max_charge_a": limit_a, "max_discharge_a": 50.0})
+    components = discovery(SETTINGS, DiscoveryInputs(info), TOPIC_ROOT, 0.0)["components"]
+    attributes = {key for key, each in components.items() if "assumed" in each.get("json_attributes_template", "")}
+    assert attributes == ({f"available_charge_power_{time}_w" for time in ("10s", "60s")} if is_marked else set())
