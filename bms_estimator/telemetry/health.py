@@ -217,7 +217,7 @@ def make_health_payload(
         recording: State of the recording; None: nothing is recorded.
         edge: State of the fleet edge; None without an edge.
         hooks: Successes and failures of alarm hooks; None without hooks.
-            pack_model: State of the slow fit; None without a slow fit.
+        pack_model: State of the slow fit; None without a slow fit.
         contradicts_device: True: ``DEVICE_SOC`` is suspected.
     """
     state = record["observer"]
