@@ -134,7 +134,7 @@ def test_normal_equations_sum_the_products_of_all_derivatives(equations: Equatio
     r = equations.residuals(unknowns_of(equations, Truth()))
     x, p, u = r.x, r.prediction, equations.unknowns
     columns, values = equations.model.derivatives(x, p, use_file_slope=False)
-    known, soc_values = equations.known, equations.model.soc_derivatives(x)[1]
+    known, soc_values = equations.known_rows, equations.model.soc_derivatives(x)[1]
     parts = [(columns, equations.weight[:, None] * values), (r.links.columns, r.links.values)]
     at = np.column_stack([equations.model.soc_derivatives(x)[0][known], np.full(known.size, u.full.start)])
     parts.append((at, np.column_stack([soc_values[known], equations.is_full]) / equations.known_std[:, None]))
