@@ -10,7 +10,7 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import MIN_GAP_CHARGE
 from bms_estimator.calibration.cleaning.rests import remove_glitches, resting_samples, true_runs
-from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, coldness
+from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, relaxation_excess
 from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.kernels.cell_model.open_loop import hysteresis
@@ -181,7 +181,9 @@ def _soc_of_rest(rest: Rest, settings: np.void, hysteresis_mean: float, hysteres
         hysteresis_v = amplitude * hysteresis_mean * on_grid(soc, settings["hysteresis_v"])
         temperature_v = (temperature_c - REFERENCE_C) * on_grid(soc, settings["per_kelvin_v"])
         soc = soc_from_ocv(rest.ocv_v - (hysteresis_v + temperature_v), *curve)
-    cold_v = COLD_V * float(coldness(np.array([rest.temperature_c]))[0]) * min(1.0, LONG_REST_S / rest.duration_s)
+    cold_v = (
+        COLD_V * float(relaxation_excess(np.array([rest.temperature_c]))[0]) * min(1.0, LONG_REST_S / rest.duration_s)
+    )
     unrelaxed_v = settings["series"] * (RELAXED_V + cold_v)
     hysteresis_std_v = amplitude * hysteresis_std * on_grid(soc, settings["hysteresis_v"])
     return _SocOfRest(

@@ -30,15 +30,15 @@ CAPACITY_RATIOS = np.linspace(0.6, 1.5, 181)
 """True capacities that are tried, relative to the capacity of the cell file."""
 OFFSET_C_RATES = np.linspace(-0.05, 0.05, 201)
 """Offsets of the current that are tried, as a C-rate [1/h]."""
-FLOOR_QUANTILE = 0.02
+BASE_QUANTILE = 0.02
 """Quantile of the absolute current that estimates the current between the loads. It ignores a few smaller values."""
-FLOOR_TOLERANCE = 0.2
+BASE_TOLERANCE = 0.2
 """Maximum deviation of a sample from the current between the loads, relative to this current."""
 MIN_LOAD_FACTOR = 5.0
 """Minimum ratio of the largest current to the current between the loads. With a constant load, both are equal."""
-MIN_FLOORS = 3
+MIN_BASE_PERIODS = 3
 """Minimum number of periods between loads."""
-MIN_FLOOR_FRACTION = 0.1
+MIN_BASE_FRACTION = 0.1
 """Minimum fraction of the samples between loads."""
 MAX_POINTS = 4000
 """Approximate number of samples for which corrections are tried."""
@@ -89,9 +89,9 @@ def reference_faults(
     text = _explanation(curve, validation, cell) if curve.rms_v(curve.soc) > good_rms_v else None
     if text:
         errors.append(ReferenceFault(text, affects_voltage=True))
-    if not errors and curve.rms_v(curve.soc) > good_rms_v and (text := _constant_floor(validation, cell)):
+    if not errors and curve.rms_v(curve.soc) > good_rms_v and (text := _constant_base_current(validation, cell)):
         errors.append(ReferenceFault(text, affects_voltage=True))
-    if validation.initial_soc_from != GIVEN and not curve.shows_shift():
+    if validation.initial_soc_from != GIVEN and not curve.depends_on_initial_soc():
         errors.append(ReferenceFault(_undetermined_start(validation), affects_voltage=False))
     if not errors and faults & FAULTS:
         errors.append(
@@ -127,13 +127,13 @@ class _Curve:
         error_v = self._error_v + self._ocv_v - self._at(soc)
         return float(np.sqrt(np.mean(error_v**2))) / self._series
 
-    def start_shows_shift(self) -> bool:
+    def start_depends_on_soc(self) -> bool:
         """Return True if the OCV at the start changes visibly with the SOC."""
         return self._is_visible(self._start_soc)
 
-    def shows_shift(self) -> bool:
+    def depends_on_initial_soc(self) -> bool:
         """Return True if the voltage at the start or over the capture changes visibly with the initial SOC."""
-        return self.start_shows_shift() or self._is_visible(self.soc)
+        return self.start_depends_on_soc() or self._is_visible(self.soc)
 
     def _is_visible(self, soc: Floats) -> bool:
         if soc.size == 0:
@@ -157,7 +157,7 @@ def _outside(validation: Validation, cell: CellModel) -> str | None:
 def _explanation(curve: _Curve, validation: Validation, cell: CellModel) -> str | None:
     """Return a sentence if a correction of the reference explains most of the voltage error."""
     corrections = [_capacity_correction(curve, validation, cell), _offset_correction(curve, cell)]
-    if validation.initial_soc_from in {GIVEN, UNDER_LOAD} or not curve.start_shows_shift():
+    if validation.initial_soc_from in {GIVEN, UNDER_LOAD} or not curve.start_depends_on_soc():
         corrections.append(_start_correction(curve, validation))
     limit_v = MAX_UNEXPLAINED * curve.rms_v(curve.soc)
     found = sorted((each for each in corrections if each and each.rms_v <= limit_v), key=lambda each: each.rms_v)
@@ -209,21 +209,21 @@ def _start_correction(curve: _Curve, validation: Validation) -> _Correction | No
     return _Correction(f"an SOC of about {100.0 * soc:.0f} % at the start (--soc)", best[1])
 
 
-def _constant_floor(validation: Validation, cell: CellModel) -> str | None:
+def _constant_base_current(validation: Validation, cell: CellModel) -> str | None:
     """Return a sentence if the current between the loads is constant, but not 0, and its charge exceeds ``MAX_OUTSIDE``."""
     current_a = validation.current_a
-    floor_a = float(np.quantile(np.abs(current_a), FLOOR_QUANTILE)) * float(np.sign(np.median(current_a)) or 1.0)
-    is_floor = np.abs(current_a - floor_a) <= FLOOR_TOLERANCE * abs(floor_a)
-    charge = abs(floor_a) * float(validation.time_s[-1]) / 3600.0 / cell.cell.capacity_ah
+    base_a = float(np.quantile(np.abs(current_a), BASE_QUANTILE)) * float(np.sign(np.median(current_a)) or 1.0)
+    is_base = np.abs(current_a - base_a) <= BASE_TOLERANCE * abs(base_a)
+    charge = abs(base_a) * float(validation.time_s[-1]) / 3600.0 / cell.cell.capacity_ah
     if (
         charge <= MAX_OUTSIDE
-        or np.abs(current_a).max() < MIN_LOAD_FACTOR * abs(floor_a)
-        or len(true_runs(is_floor)) < MIN_FLOORS
-        or is_floor.mean() < MIN_FLOOR_FRACTION
+        or np.abs(current_a).max() < MIN_LOAD_FACTOR * abs(base_a)
+        or len(true_runs(is_base)) < MIN_BASE_PERIODS
+        or is_base.mean() < MIN_BASE_FRACTION
     ):
         return None
     return (
-        f"The current between the loads is not 0, but {floor_a:.2g} A. If the load was off there, this is an offset of the "
+        f"The current between the loads is not 0, but {base_a:.2g} A. If the load was off there, this is an offset of the "
         f"current sensor, which moves the SOC by {100.0 * charge:.0f} % over the capture: check the zero of the sensor."
     )
 

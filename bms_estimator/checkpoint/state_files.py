@@ -50,7 +50,6 @@ version."""
 FORMER_FORMAT = 7
 """Version of files that also contain counters and alarms. ``RunFile`` migrates these."""
 DAY_S = 86400.0
-"""Length of a day [s]."""
 MAX_FILE_BYTES = 1 << 20
 """Maximum size of a checkpoint file [bytes]. A file of the former format has about 112 kB."""
 MAX_FILES = 8

@@ -191,6 +191,7 @@ def peek_probes(data: bytes) -> bool:
 def _decode_body(
     body: bytes, count: int, cells: int, columns: Sequence[tuple[str, np.dtype[Any]]]
 ) -> tuple[SampleBlock, CellBlock]:
+    """Decompress and decode the samples of a block, and their cell voltages."""
     size = count * sum(dtype.itemsize for _, dtype in columns)
     max_size = size + (cell_voltages.MAX_BYTES if cells else 0)
     unpacker = zlib.decompressobj()
@@ -209,6 +210,7 @@ def _decode_body(
 
 
 def _decode_samples(raw: bytes, count: int, columns: Sequence[tuple[str, np.dtype[Any]]]) -> SampleBlock:
+    """Decode the columns of samples."""
     samples = np.zeros(count, dtype=SAMPLE)
     offset = 0
     for name, dtype in columns:

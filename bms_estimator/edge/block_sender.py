@@ -158,7 +158,6 @@ def _fill_non_finite(source_s: Times, previous_s: float) -> Times:
 
 
 MIB = 1 << 20
-"""Mebibyte [bytes]."""
 MAX_BLOCK_AGE = 1.5
 """Age at which an incomplete block is sent, as a multiple of the block duration."""
 FINAL_SEND_TIMEOUT_S = 2.0

@@ -17,7 +17,7 @@ import structlog
 
 from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import with_oldest
-from bms_estimator.edge.block_table import LATEST_S, NS, PageRead, StoreResult, StoreTransaction
+from bms_estimator.edge.block_table import LATEST_S, NS_PER_S, PageRead, StoreResult, StoreTransaction
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.mqtt.connection import Message, QueuedMessage
 from bms_estimator.store.database import Database, StoreError
@@ -126,10 +126,10 @@ class BlockStore:
 
     def on_request(self, request: BlockRequest) -> None:
         """Handle a worker's request for its next block."""
-        if self._on_disk is None or request.store < (created_ns := self._on_disk.state.created_s * NS):
+        if self._on_disk is None or request.store < (created_ns := self._on_disk.state.created_s * NS_PER_S):
             return
         if request.store > created_ns or request.number > self._on_disk.state.next_number:
-            self._request_new_store(math.ceil(request.store / NS))  # rounded up: the new store must be later
+            self._request_new_store(math.ceil(request.store / NS_PER_S))  # rounded up: the new store must be later
             return
         self._first_unconfirmed = max(self._first_unconfirmed, request.number)
         self._cursor = max(self._cursor, self._first_unconfirmed)

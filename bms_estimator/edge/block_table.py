@@ -10,9 +10,8 @@ import numpy as np
 from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import MAX_NUMBER, Block, BlockError, decode, encode
 
-NS = 1_000_000_000
-"""Nanoseconds in a second."""
-LATEST_S = MAX_NUMBER // NS - 1
+NS_PER_S = 1_000_000_000
+LATEST_S = MAX_NUMBER // NS_PER_S - 1
 """Latest creation time of a store, in the year 2262 [s since 1970]."""
 DROP_ROWS = 64
 """Maximum number of rows that are read at a time when blocks are dropped."""
@@ -177,7 +176,7 @@ def _insert(connection: sqlite3.Connection, state: StoreState, ready: ReadyBlock
     # sample times never decrease within a store, even if the clock was set back before a restart
     samples["time_s"] = np.maximum(samples["time_s"] - state.created_s, state.last_s)
     block = Block(
-        store_created_ns=state.created_s * NS,
+        store_created_ns=state.created_s * NS_PER_S,
         number=state.next_number,
         oldest=state.next_number,  # replaced by the oldest number at the time of sending
         arrival_s=ready.arrival_s,
@@ -219,4 +218,4 @@ def _is_valid(created_s: int, number: int, data: Any) -> bool:
         block = decode(data)
     except BlockError:
         return False
-    return block.store_created_ns == created_s * NS and block.number == number
+    return block.store_created_ns == created_s * NS_PER_S and block.number == number

@@ -25,7 +25,6 @@ the server's limit. If the voltages of all samples would be larger, only every s
 MAX_V = 100.0
 """Maximum magnitude of a voltage [V]; a larger one is not sent."""
 UNITS_PER_V = 5000.0
-"""Number of units in a volt."""
 _STRIDE_BYTES, _MEAN_BYTES, _CELL_BYTES = 2, 4, 2
 _NO_MEAN, _NO_CELL, _MAX_DIFFERENCE = -(2**31), -(2**15), 2**15 - 1
 

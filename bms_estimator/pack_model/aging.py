@@ -9,7 +9,6 @@ from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.intervals import DAY_S, Intervals
 
 YEAR_S = 365.0 * DAY_S
-"""Length of a year [s]."""
 MIN_VARIANCE = 1e-12
 """Minimum variance in the divisor of the trend. The variance over a history of one interval is 0."""
 

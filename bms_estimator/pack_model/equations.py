@@ -24,10 +24,10 @@ HUBER = 3.0
 FITTED_RMS, ZONES = 0.3, 10
 """RMS residual up to which the model fits the rows of one SOC zone and direction [std], and number of zones over SOC 0..1. Where
 the model fits the pack, the RMS residual is 0.05 to 0.3."""
-BEYOND_SOC = 0.03
+TOLERATED_EXCESS_SOC = 0.03
 """Tolerated distance of an SOC from the range 0..1. Assumed."""
-BEYOND_STD = 0.01
-"""Excess over ``BEYOND_SOC`` that costs as much as a residual of 1 std [SOC]. Assumed."""
+EXCESS_STD_SOC = 0.01
+"""Excess over ``TOLERATED_EXCESS_SOC`` that costs as much as a residual of 1 std [SOC]. Assumed."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Residuals:
     """Residuals of the SOC at the start of each linked interval."""
     reference: Floats
     """Residual of each known SOC."""
-    beyond: Floats
+    soc_excess: Floats
     """Excess of each row's SOC beyond its tolerated range."""
 
 
@@ -121,12 +121,14 @@ class Equations:
         p = self.model.predict(x)
         voltage = self.weight * (self.voltage_v - p.voltage_v)
         reference = (self.known_soc - p.soc[self.known_rows] - self.is_full * x[self.unknowns.full]) / self.known_std
-        beyond = (np.minimum(p.soc + BEYOND_SOC, 0.0) + np.maximum(p.soc - 1.0 - BEYOND_SOC, 0.0)) / BEYOND_STD
+        soc_excess = (
+            np.minimum(p.soc + TOLERATED_EXCESS_SOC, 0.0) + np.maximum(p.soc - 1.0 - TOLERATED_EXCESS_SOC, 0.0)
+        ) / EXCESS_STD_SOC
         link_cost, links = self._link(x)
         deviation = x - self.prior.mean
         cost = huber_cost(voltage) + deviation @ self.prior.precision @ deviation
-        cost += link_cost + reference @ reference + beyond @ beyond
-        return Residuals(x, float(cost), p, voltage, links, reference, beyond)
+        cost += link_cost + reference @ reference + soc_excess @ soc_excess
+        return Residuals(x, float(cost), p, voltage, links, reference, soc_excess)
 
     def normal_equations(self, r: Residuals, *, use_file_slope: bool = False) -> NormalEquations:
         """Return the normal equations at the unknowns of ``r``.
@@ -149,12 +151,12 @@ class Equations:
     def _soc_blocks(self, r: Residuals) -> tuple[Block, Block]:
         """Return the blocks of known SOCs and of SOCs beyond their tolerated range."""
         columns, values = self.model.soc_derivatives(r.x)
-        known_rows, out = self.known_rows, np.flatnonzero(r.beyond)
+        known_rows, out = self.known_rows, np.flatnonzero(r.soc_excess)
         known_columns = np.column_stack([columns[known_rows], np.full(known_rows.size, self.unknowns.full.start)])
         known_values = np.column_stack([values[known_rows], self.is_full]) / self.known_std[:, None]
         return (
             Block(r.reference, known_columns, known_values),
-            Block(-r.beyond[out], columns[out], values[out] / BEYOND_STD),
+            Block(-r.soc_excess[out], columns[out], values[out] / EXCESS_STD_SOC),
         )
 
     def _link(self, x: Floats) -> tuple[float, Block]:

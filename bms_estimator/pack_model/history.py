@@ -26,7 +26,6 @@ RECENT_SEGMENTS = MAX_SEGMENTS // 2
 """Number of the latest segments that are kept even without a known SOC. Of earlier segments, those with a known SOC are
 preferred."""
 DAY_S = 86400.0
-"""Length of a day [s]."""
 MEAN_FIELDS = ("elapsed_s", "voltage_v", "current_a", "between_a2", "skew_a2", "x_a", "settled_s", "temperature_c", "charge_as",
                "charge_variance_as2", "throughput_soc", "hysteresis", "soc")  # fmt: skip
 """Fields of ``HISTORY_ROW`` that a merged row averages, weighted by duration."""

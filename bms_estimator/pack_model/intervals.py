@@ -10,7 +10,6 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import CellCurves
 
 DAY_S = 86400.0
-"""Length of a day [s]."""
 INTERVAL_S = DAY_S
 """Maximum duration of an interval [s]."""
 COUNTED_STD = 0.015
@@ -19,7 +18,6 @@ band reports no current at night, so that the charge counted in a day may be wro
 MAX_INTERVALS = 200
 """Maximum number of intervals, unless there are more segments. Each interval adds three unknowns."""
 HOUR_S = 3600.0
-"""Length of an hour [s]."""
 DAILY_STD_SOC = 0.002
 """Std of the SOC counted over a day without throughput, due to charge that is not counted at rest, such as self-discharge.
 Assumed."""

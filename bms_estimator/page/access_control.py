@@ -78,6 +78,7 @@ def make_access_control(settings: PageSettings, token: str | None = None) -> Acc
 
 
 def _token(settings: PageSettings) -> str | None:
+    """Read the token; None if the settings name no file."""
     name = settings.token_file
     if name is None:
         return None

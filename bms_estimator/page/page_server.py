@@ -37,14 +37,12 @@ SCRIPTS = (
     "uplot.js",
     "what_if.js",
 )
-"""Scripts of the page."""
 FILES = {
     "/": File(STATIC / "index.html", "text/html"),
     "/style.css": File(STATIC / "style.css", "text/css"),
     **{f"/{name}": File(STATIC / name, "text/javascript") for name in SCRIPTS},
     "/icon.svg": File(STATIC / "icon.svg", "image/svg+xml"),
 }
-"""Static files by URL path."""
 
 ForecastHandler = Callable[[bytes], Awaitable[bytes | None]]
 """Function that answers the payload of a request ``forecast``; None: too many requests."""

@@ -14,8 +14,7 @@ MONTH_S = 30.0 * DAY_S
 """Length of a month in "change per month" [s]."""
 MIN_CHANGE_S = 7.0 * DAY_S
 """Minimum duration of a history for a change per month [s]. A change in less time is smaller than its std."""
-MILLIOHM = 1e3
-"""Milliohms in an ohm."""
+MILLIOHM_PER_OHM = 1e3
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ def aging_group(aging: AgingHistory) -> Group:
             Plot(name, small_plot(partial(_draw, course.end_s, *part), salt=f"aging-{name}"))
             for name, part in (
                 ("Capacity with ±2 std", (course.capacity, 1.0, "capacity [Ah]", COLORS[0])),
-                ("DC resistance with ±2 std", (course.total, MILLIOHM, "DC resistance [mΩ]", COLORS[1])),
+                ("DC resistance with ±2 std", (course.total, MILLIOHM_PER_OHM, "DC resistance [mΩ]", COLORS[1])),
             )
         )
         sentences.append(
@@ -65,8 +64,8 @@ def aging_group(aging: AgingHistory) -> Group:
 def _rows(course: AgingCourse) -> tuple[tuple[str, ...], ...]:
     quantities = (
         ("capacity [Ah]", course.capacity, 1.0),
-        ("R_s [mΩ]", course.series, MILLIOHM),
-        ("DC resistance [mΩ]", course.total, MILLIOHM),
+        ("R_s [mΩ]", course.series, MILLIOHM_PER_OHM),
+        ("DC resistance [mΩ]", course.total, MILLIOHM_PER_OHM),
     )
     return tuple(
         (

@@ -1,7 +1,6 @@
 """Numbers and durations as text."""
 
 MINUTE_S, HOUR_S, DAY_S = 60.0, 3600.0, 86_400.0
-"""Lengths of a minute, an hour and a day [s]."""
 MIN_IN_HOURS_S = 2.0 * HOUR_S
 """Shortest duration that is given in hours [s]."""
 MIN_IN_DAYS_S = 2.0 * DAY_S

@@ -20,7 +20,6 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.store.database import Database, StoreError
 
 MINUTE_S = 60
-"""Length of a minute [s]."""
 MAX_INTERVAL_S = 30.0
 """Maximum interval between two publications that is never a gap [s]. No charge is counted over a gap."""
 GAP_RATIO = 3.0
@@ -139,7 +138,6 @@ disk, because ``WRITE_S`` is longer than the interval between the database's fsy
 WRITTEN_ROWS = 4
 """Number of rows in a transaction. A transaction writes about nine disk blocks, whatever its number of rows."""
 MINUTES_A_DAY = 1440
-"""Number of minutes in a day."""
 MAX_WAITING_ROWS = 2 * MINUTES_A_DAY
 """Maximum number of rows in memory while the disk cannot be written."""
 MAX_WAITING_EVENTS = 1000

@@ -75,6 +75,7 @@ class HistoryReader:
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
+        """Open the file read-only; convert its errors to a UserError."""
         self._require_readable()
         try:
             with closing(sqlite3.connect(f"{self._path.absolute().as_uri()}?mode=ro", uri=True)) as connection:

@@ -16,7 +16,7 @@ from structlog.testing import capture_logs
 from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import Block, decode
 from bms_estimator.edge.block_store import BlockStore
-from bms_estimator.edge.block_table import EDGE_TABLES, NS
+from bms_estimator.edge.block_table import EDGE_TABLES, NS_PER_S
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.store.database import Database
@@ -79,10 +79,10 @@ async def test_blocks_are_taken_in_order_with_times_relative_to_the_store(tmp_pa
         await write_blocks(store, *ready)
         blocks = await take(store, 4)
         assert numbers(blocks) == [1, 2, 3, 4]
-        assert {block.store_created_ns for block in blocks} == {int(WALL_S) * NS}
+        assert {block.store_created_ns for block in blocks} == {int(WALL_S) * NS_PER_S}
         for block, original in zip(blocks, ready, strict=True):
             assert block.arrival_s == original.arrival_s
-            assert (block.store_created_ns / NS + block.samples["time_s"] == original.samples["time_s"]).all()
+            assert (block.store_created_ns / NS_PER_S + block.samples["time_s"] == original.samples["time_s"]).all()
             assert (block.samples["voltage_v"] == original.samples["voltage_v"]).all()
 
 
@@ -93,14 +93,14 @@ async def test_restarted_edge_continues_numbers_and_time_of_the_store_and_sends_
         await write_blocks(store, *minute_blocks(6))
         for block in await take(store, 6):
             store.acknowledge(block.number)
-        store.on_request(BlockRequest(store=int(WALL_S) * NS, number=4, resend=False))
+        store.on_request(BlockRequest(store=int(WALL_S) * NS_PER_S, number=4, resend=False))
         assert (store.waiting, store.unconfirmed) == (0, 3)
     async with open_store(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
         assert store.last_s == WALL_S + 304.0  # five samples from 300 s on
         await write_blocks(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
         blocks = await take(store, 4)
     assert numbers(blocks) == [4, 5, 6, 7]
-    assert {block.store_created_ns for block in blocks} == {int(WALL_S) * NS}
+    assert {block.store_created_ns for block in blocks} == {int(WALL_S) * NS_PER_S}
     assert {block.oldest for block in blocks} == {4}
     assert blocks[-1].samples["time_s"].tolist() == [304.0] * 5
 
@@ -137,7 +137,7 @@ async def test_resend_request_repeats_the_requested_block_and_all_later_ones(tmp
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(8))
         await take(store, 8)
-        store.on_request(BlockRequest(store=int(WALL_S) * NS, number=3, resend=True))
+        store.on_request(BlockRequest(store=int(WALL_S) * NS_PER_S, number=3, resend=True))
         blocks = await take(store, 6)
         assert (numbers(blocks), {block.oldest for block in blocks}) == ([3, 4, 5, 6, 7, 8], {3})
 
@@ -147,7 +147,7 @@ async def test_repeated_resend_request_is_ignored_within_the_resend_interval(tmp
         store._resend_s = LONG_S
         await write_blocks(store, *minute_blocks(8))
         await take(store, 8)
-        request = BlockRequest(store=int(WALL_S) * NS, number=3, resend=True)
+        request = BlockRequest(store=int(WALL_S) * NS_PER_S, number=3, resend=True)
         store.on_request(request)
         await take(store, 6)
         store.on_request(request)
@@ -158,8 +158,8 @@ async def test_repeated_resend_request_is_ignored_within_the_resend_interval(tmp
 @pytest.mark.parametrize(
     "block_request",
     [
-        BlockRequest(store=(int(WALL_S) + 77) * NS + 1, number=1, resend=False),
-        BlockRequest(store=int(WALL_S) * NS, number=100, resend=True),
+        BlockRequest(store=(int(WALL_S) + 77) * NS_PER_S + 1, number=1, resend=False),
+        BlockRequest(store=int(WALL_S) * NS_PER_S, number=100, resend=True),
     ],
     ids=["of a later store", "of a later number"],
 )
@@ -171,12 +171,12 @@ async def test_request_for_blocks_later_than_those_on_disk_begins_a_new_store(
         await write_blocks(store, *minute_blocks(3))
         await take(store, 3)
         store.on_request(block_request)
-        await until(lambda: store._on_disk.state.created_s * NS > block_request.store)
+        await until(lambda: store._on_disk.state.created_s * NS_PER_S > block_request.store)
         await write_blocks(store, block_at(WALL_S + 1000.0))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest) == (1, 1)
         assert block.store_created_ns > block_request.store
-        assert block.store_created_ns / NS + block.samples["time_s"][0] == WALL_S + 1000.0
+        assert block.store_created_ns / NS_PER_S + block.samples["time_s"][0] == WALL_S + 1000.0
         assert store.dropped == 3
 
 
@@ -207,7 +207,7 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
         async with open_store(path, wall_s=WALL_S + 500.0) as store:
             await write_blocks(store, block_at(WALL_S + 500.0))
             (block,) = await take(store, 1)
-    assert block.store_created_ns > created_s * NS
+    assert block.store_created_ns > created_s * NS_PER_S
     assert block.number == 1
     quarantined = [line for line in lines if line["event"] == "database set aside, a new one is begun"]
     assert bool(quarantined) == (damage in ("no database", "other tables"))
@@ -221,7 +221,9 @@ async def test_file_deleted_while_in_use_loses_only_the_blocks_written_before(tm
         await write_blocks(store, *minute_blocks(2, first=3))
         blocks = await take(store, 2)
         assert numbers(blocks) == [1, 2]
-        assert blocks[0].store_created_ns == (int(WALL_S) + 180) * NS  # created at the first block after the deletion
+        assert (
+            blocks[0].store_created_ns == (int(WALL_S) + 180) * NS_PER_S
+        )  # created at the first block after the deletion
         assert blocks[0].samples["time_s"][0] == 0.0
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.kernels.accumulators.history import ROW_SOC
 from bms_estimator.kernels.least_squares import backward_substitution, forward_substitution
-from bms_estimator.pack_model.equations import BEYOND_SOC, FITTED_RMS, Equations
+from bms_estimator.pack_model.equations import FITTED_RMS, TOLERATED_EXCESS_SOC, Equations
 from bms_estimator.pack_model.solve import cholesky, minimize
 from tests.pack_model.histories import (
     Truth,
@@ -87,7 +87,7 @@ def test_gradient_of_the_cost(equations: Equations) -> None:
     x = random_unknowns(equations)
     x[equations.unknowns.soc] += 0.15
     r = equations.residuals(x)
-    assert np.any(r.beyond > 0.0)
+    assert np.any(r.soc_excess > 0.0)
     assert np.any(np.abs(r.voltage) > 3.0)
     b = equations.normal_equations(r).b
     u = equations.unknowns
@@ -101,7 +101,7 @@ def test_gradient_of_the_cost(equations: Equations) -> None:
 
 
 def test_cost_of_a_soc_beyond_its_range_decreases_along_the_step(equations: Equations) -> None:
-    x = unknowns_of(equations, Truth(soc=1.0 + BEYOND_SOC + 0.07))
+    x = unknowns_of(equations, Truth(soc=1.0 + TOLERATED_EXCESS_SOC + 0.07))
     r = equations.residuals(x)
     normal = equations.normal_equations(r)
     step = np.linalg.solve(np.tril(normal.a) + np.tril(normal.a, -1).T, normal.b)
@@ -134,7 +134,7 @@ def test_normal_equations_sum_the_products_of_all_derivatives(equations: Equatio
     r = equations.residuals(unknowns_of(equations, Truth()))
     x, p, u = r.x, r.prediction, equations.unknowns
     columns, values = equations.model.derivatives(x, p, use_file_slope=False)
-    known, soc_values = equations.known, equations.model.soc_derivatives(x)[1]
+    known, soc_values = equations.known_rows, equations.model.soc_derivatives(x)[1]
     parts = [(columns, equations.weight[:, None] * values), (r.links.columns, r.links.values)]
     at = np.column_stack([equations.model.soc_derivatives(x)[0][known], np.full(known.size, u.full.start)])
     parts.append((at, np.column_stack([soc_values[known], equations.is_full]) / equations.known_std[:, None]))

@@ -85,6 +85,7 @@ def undetermined_start(capture: CleanCapture, cell: CellModel) -> str | None:
 
 
 def _start_of(capture: CleanCapture, cell: CellModel, given: float | None) -> StartSoc:
+    """Return the given SOC or, if None, the SOC from the first voltage."""
     low, high = _soc_range(capture, cell)
     soc, full_v = initial_soc(capture, cell), ocv(FULL_SOC, *ocv_grid(cell))
     reason = _range_text(capture, low, high)

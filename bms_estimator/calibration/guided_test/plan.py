@@ -47,7 +47,6 @@ LONG = Plan("long", load_c_rate=0.5, step_soc=0.05, rest_s=1800.0, full_rest_s=3
 """Twenty-one discharges with rests of half an hour: 13.5 h after the charge. The voltage relaxes to within a few millivolts in
 each rest."""
 PLANS = {plan.name: plan for plan in (SHORT, LONG)}
-"""Plans by name."""
 
 
 @dataclass(frozen=True)

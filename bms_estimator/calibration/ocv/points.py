@@ -85,7 +85,7 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
     temperature_c = np.array([rest.temperature_c for rest in rests])
     duration_s = np.array([rest.duration_s for rest in rests])
     after_charge = np.array([rest.after_charge for rest in rests])
-    cold_v = COLD_V * coldness(temperature_c) * np.minimum(1.0, LONG_REST_S / np.maximum(duration_s, 1.0))
+    cold_v = COLD_V * relaxation_excess(temperature_c) * np.minimum(1.0, LONG_REST_S / np.maximum(duration_s, 1.0))
     order = np.argsort(test.soc, kind="stable")
     return Points(
         soc=test.soc[order],
@@ -100,7 +100,7 @@ def points_of(test: RelaxationTest, series_count: int = 1) -> Points:
     )
 
 
-def coldness(temperature_c: Floats) -> Floats:
+def relaxation_excess(temperature_c: Floats) -> Floats:
     """Return the relaxation time relative to that at 25 C, less 1; 0 for an unknown temperature or above 25 C."""
     colder = np.maximum(REFERENCE_C - np.nan_to_num(temperature_c, nan=REFERENCE_C), 0.0)
     return np.asarray(2.0 ** (colder / DOUBLING_K) - 1.0, dtype=np.float64)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from bms_estimator.calibration.cleaning.rests import SOC_SLACK
-from bms_estimator.calibration.ocv.points import COLD_V, Points, coldness
+from bms_estimator.calibration.ocv.points import COLD_V, Points, relaxation_excess
 from bms_estimator.calibration.ocv.slow_branch import SlowBranch
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
@@ -204,7 +204,7 @@ def _points(
     """
     std_v = np.hypot(POINT_V * series_count, POINT_SOC * np.gradient(ocv_v, grid))
     everywhere = np.ones(grid.size)
-    cold_v = cold_fraction * COLD_V * series_count * coldness(temperature_c * everywhere)
+    cold_v = cold_fraction * COLD_V * series_count * relaxation_excess(temperature_c * everywhere)
     return Points(
         soc=grid,
         ocv_v=ocv_v,

@@ -78,8 +78,8 @@ def find_sources(
     sources = [_slow_curve_source(curve, slow_ah, used_ah) for curve in slow] + [
         _given_curve_source(curve, series_count) for curve in curves
     ]
-    rests = [recording for recording in recordings if not branches[recording.name]]
-    tests_with_points = _tests_with_points(rests, sources, all_branches, used_ah, initial_soc, series_count)
+    rest_recordings = [recording for recording in recordings if not branches[recording.name]]
+    tests_with_points = _tests_with_points(rest_recordings, sources, all_branches, used_ah, initial_soc, series_count)
     hysteresis_source = find_hysteresis_source(sources)
     hysteresis_v, hysteresis_std_v = None, np.zeros(NODES.size)
     if hysteresis_source is not None and hysteresis_source.hysteresis_v is not None:
@@ -136,12 +136,12 @@ def _slow_curve_source(curve: SlowCurve, slow_ah: float, capacity_ah: float) -> 
 
 def _given_curve_source(curve: ExternalCurve, series_count: int) -> Source:
     """Return a given curve as a source."""
-    everywhere = np.full(curve.soc.size, float(series_count))
+    series_counts = np.full(curve.soc.size, float(series_count))
     is_flat = has_plateau(curve.soc, curve.ocv_v, series_count)
-    systematic_v = (PLATEAU_SYSTEMATIC_V if is_flat else GIVEN_SYSTEMATIC_V) * everywhere
+    systematic_v = (PLATEAU_SYSTEMATIC_V if is_flat else GIVEN_SYSTEMATIC_V) * series_counts
     if curve.std_v is not None:
         systematic_v = curve.std_v
-    points = Points(curve.soc, curve.ocv_v, GIVEN_V * everywhere, systematic_std_v=systematic_v)
+    points = Points(curve.soc, curve.ocv_v, GIVEN_V * series_counts, systematic_std_v=systematic_v)
     hysteresis_v = None
     if curve.hysteresis_v is None:
         points = replace(points, direction=np.full(curve.soc.size, -1.0))

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import BlockError, decode
-from bms_estimator.edge.block_table import NS
+from bms_estimator.edge.block_table import NS_PER_S
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection
 from bms_estimator.fleet.ingest.block_publisher import BlockPublisher
@@ -218,7 +218,7 @@ class IngestStore:
             log.warning("invalid message on the workers' subject", subject=message.subject)
             return
         position = self._open_blocks.position(pack)
-        created_ns = position.created_s * NS
+        created_ns = position.created_s * NS_PER_S
         if request.store > created_ns or (request.store == created_ns and request.number > position.next_number):
             log.warning("a worker has later blocks of this pack than this store: a new store is begun", pack=pack)
             self._begin_store(pack, request.store)
@@ -238,6 +238,6 @@ class IngestStore:
         self._set_end(pack, other_ns, last_s)
 
     def _set_end(self, pack: str, store_ns: int, last_s: float) -> None:
-        """Begin a store at the next sample, later than ``last_s`` and than the second after another store's creation."""
-        created_s = math.ceil(store_ns / NS) + 1  # the first sample sets the creation time of the new store
+        """Begin a store with the first sample after ``last_s`` and after the creation of another store."""
+        created_s = math.ceil(store_ns / NS_PER_S) + 1  # a sample after this time creates a store after the other one
         self._open_blocks.set_position(pack, PackPosition(0, 1, max(last_s, created_s)))

@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 
 from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import Block, encode, with_oldest
-from bms_estimator.edge.block_table import NS
+from bms_estimator.edge.block_table import NS_PER_S
 
 MAX_PACK_BLOCKS = 10_080
 """Maximum number of stored blocks of a pack: a week of minute blocks. Beyond it, the pack's oldest block is dropped."""
@@ -59,7 +59,7 @@ class NumberedBlock(NamedTuple):
         samples = ready.samples.copy()
         samples["time_s"] -= created_s  # exact, because the creation time is a whole number of seconds
         oldest = number  # replaced at the time of sending
-        block = Block(created_s * NS, number, oldest, ready.arrival_s, samples, ready.cells_v)
+        block = Block(created_s * NS_PER_S, number, oldest, ready.arrival_s, samples, ready.cells_v)
         return cls(pack, number, encode(block))
 
 

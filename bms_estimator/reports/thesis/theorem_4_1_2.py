@@ -54,7 +54,6 @@ class RunResult:
 
 
 PRODUCTS = ("R_ts C_ts", "R_tl C_tl")
-"""Names of the RC products."""
 
 
 def bounds_sets(cell: CellModel) -> dict[str, dict[int, Bounds]]:

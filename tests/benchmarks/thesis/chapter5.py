@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.ocv.points import pooled
+from bms_estimator.calibration.ocv.points import pool_tests
 from bms_estimator.calibration.thesis.series_resistance import SeriesResistance, SeriesResistanceFit
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock
@@ -213,7 +213,7 @@ def parameters(procedures: dict[str, Procedure]) -> Table:
         table.add_column(column, overflow="fold")
     for name, p in procedures.items():
         residual_v, rc_products = p.joint_fit.residual_v, list(products(p))
-        middle_v = residual_v[np.argmin(np.abs(pooled(p.tests).soc - MIDDLE_SOC))]
+        middle_v = residual_v[np.argmin(np.abs(pool_tests(p.tests).soc - MIDDLE_SOC))]
         table.add_row(
             name,
             str(residual_v.size),

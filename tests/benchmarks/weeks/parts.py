@@ -104,13 +104,13 @@ def set_in_curves(**values: float) -> Patch:
 
 def count_each_full(e: Equations, *_: object) -> None:
     """Give each end of charge an independent error with the std of the anchor."""
-    e.known_std = np.where(e.is_full, e.rows["reference_std"][e.known], e.known_std)
+    e.known_std = np.where(e.is_full, e.rows["reference_std"][e.known_rows], e.known_std)
 
 
 def count_each_empty(e: Equations, *_: object) -> None:
     """Give each end of discharge an independent error."""
-    is_empty = e.rows["reference_kind"][e.known] == EMPTY
-    e.known_std = np.where(is_empty, e.rows["reference_std"][e.known], e.known_std)
+    is_empty = e.rows["reference_kind"][e.known_rows] == EMPTY
+    e.known_std = np.where(is_empty, e.rows["reference_std"][e.known_rows], e.known_std)
 
 
 def links_without_gaps(cell: CellCurves, history_intervals: Intervals) -> Links:
