@@ -18,11 +18,11 @@ MIN_DRIFT_S = 2.0
 """Minimum drift of a wrong clock beyond its largest step [s]. Changes of a network's delay are smaller."""
 MAX_SPACING_RATIO = 2.5
 """Maximum ratio of two successive intervals between windows. A larger one shows an outage."""
-RIGHT_STEPS = 3
+RECOVERY_STEPS = 3
 """Number of successive windows without drift and large jumps after which a clock is usable again."""
 MAX_JUMP_RATE = 0.8
-"""Maximum sum of the jumps in a window per time, if three successive windows exceed it. A clock that is set once jumps in one
-window. Samples at 1 Hz that overtake each other by up to 3 s reach 0.7 in one of three."""
+"""Maximum sum of the jumps in a window, relative to its duration. Three successive windows above it show a wrong clock. A clock
+that is set once jumps in one window. Samples at 1 Hz that overtake each other by up to 3 s reach 0.7 in one of three windows."""
 _JUMPS_TEXT = (
     "the times of the source jump again and again, and the arrival times are used instead; let only one device send, "
     "correct its clock, or do not send its times"
@@ -66,19 +66,19 @@ class ClockRate:
 
     def __init__(self) -> None:
         self.fault = ""
-        self._points: deque[Point] = deque(maxlen=MAX_POINTS)  # of successive windows
+        self._points: deque[Point] = deque(maxlen=MAX_POINTS)  # least delayed samples of successive windows
         self._floor_s = float("inf")  # least delay before ``_points``
-        self._open: Point | None = None  # of the present window
+        self._least_delayed: Point | None = None  # least delayed sample of the present window
         self._begin_s = self._spacing_s = 0.0
         self._jumps_s = 0.0  # sum of the jumps in the present window
-        self._jumping: deque[bool] = deque(maxlen=RIGHT_STEPS)  # True for each window with large jumps
+        self._jumping: deque[bool] = deque(maxlen=RECOVERY_STEPS)  # True for each window with large jumps
 
     def add(self, point: Point) -> None:
         """Add a sample to the present window."""
-        if self._open is None:
+        if self._least_delayed is None:
             self._begin_s = point.arrival_s
-        if self._open is None or point.delay_s <= self._open.delay_s:
-            self._open = point
+        if self._least_delayed is None or point.delay_s <= self._least_delayed.delay_s:
+            self._least_delayed = point
 
     def on_jump(self, size_s: float) -> None:
         """Add a jump to the present window [s]. Forget the least delay, because the device's clock was set."""
@@ -91,9 +91,9 @@ class ClockRate:
         Returns:
             First point with wrong times if a wrong clock is detected now; otherwise None.
         """
-        if self._open is None or arrival_s - self._begin_s < WINDOW_S:
+        if self._least_delayed is None or arrival_s - self._begin_s < WINDOW_S:
             return None
-        point, self._open = self._open, None
+        point, self._least_delayed = self._least_delayed, None
         self._jumping.append(self._jumps_s >= MAX_JUMP_RATE * (arrival_s - self._begin_s))
         self._jumps_s = 0.0
         if self._points and self._is_outage(point):
@@ -104,13 +104,13 @@ class ClockRate:
             self._restart(point)
         steps_s = self._steps_s()
         if self.fault:
-            recent = steps_s[-RIGHT_STEPS:]
-            self.fault = self.fault if len(recent) < RIGHT_STEPS or any(recent) or any(self._jumping) else ""
+            recent = steps_s[-RECOVERY_STEPS:]
+            self.fault = self.fault if len(recent) < RECOVERY_STEPS or any(recent) or any(self._jumping) else ""
         elif self._is_wrong(steps_s):
             first = self._points[0]
-            self.fault = _text((point.device_s - first.device_s) / (point.arrival_s - first.arrival_s))
+            self.fault = _rate_fault((point.device_s - first.device_s) / (point.arrival_s - first.arrival_s))
             return first
-        elif len(self._jumping) == RIGHT_STEPS and all(self._jumping):
+        elif len(self._jumping) == RECOVERY_STEPS and all(self._jumping):
             self.fault = _JUMPS_TEXT
             return self._points[0]
         return None
@@ -125,7 +125,7 @@ class ClockRate:
         return self._spacing_s > MAX_SPACING_RATIO * max(before_s, WINDOW_S)
 
     def _restart(self, point: Point) -> None:
-        """Compare only windows from that of ``point`` on."""
+        """Restart the comparison of windows with that of ``point``."""
         self._floor_s = min(self._floor_s, *(each.delay_s for each in self._points))
         self._points.clear()
         self._points.append(point)
@@ -152,7 +152,7 @@ def _drift_s(before: Point, after: Point) -> float:
     return drift_s if abs(drift_s) > MAX_RATE_ERROR * (after.arrival_s - before.arrival_s) else 0.0
 
 
-def _text(rate: float) -> str:
+def _rate_fault(rate: float) -> str:
     unit = next((text for factor, text in _UNITS.items() if abs(rate / factor - 1.0) < UNIT_TOLERANCE), "")
     cause = f"its times are {unit}: correct the unit" if unit else "correct its clock, or do not send its times"
     return f"the clock of the source runs at {rate:.3g} times the rate of the arrivals, which are used instead; {cause}"
@@ -164,7 +164,7 @@ MAX_CONSTANT_S = 10.0
 """Maximum time for which a timestamp may stay constant while samples arrive [s]. Then the timestamp is ignored."""
 MAX_SLOWNESS = 0.01
 """Maximum relative amount by which a device's clock is slower than the host's."""
-START_S = 1.0
+MAX_FIRST_BACKLOG_S = 1.0
 """Maximum duration of a backlog that is being sent at the first sample [s]. Its samples keep their own times."""
 
 
@@ -179,7 +179,7 @@ class DeviceClock:
 
     The time leads the arrivals by at most ``MAX_LEAD_S``, whatever timestamps a device sends. Therefore no delay of an alarm
     ends much too early. The delay of a sample is its arrival minus its time here, which does not change if the clock is set.
-    After ``START_S`` the least delay never decreases, so that the leads of several timestamps do not add up.
+    After ``MAX_FIRST_BACKLOG_S`` the least delay never decreases, so that the leads of several timestamps do not add up.
 
     Attributes:
         jumps: Number of rejected timestamps.
@@ -215,7 +215,7 @@ class DeviceClock:
     def _advance(self, arrival_s: float, device_s: float, wrong_since: Point | None) -> None:
         """Advance ``_last_s``. If a wrong clock was just detected, ``wrong_since`` is the first point with wrong times."""
         step_s, elapsed_s = device_s - self._device_s, max(arrival_s - self._arrival_s, 0.0)
-        if step_s == 0.0 and elapsed_s < MAX_CONSTANT_S and not self._rate.fault:  # several may share one timestamp
+        if step_s == 0.0 and elapsed_s < MAX_CONSTANT_S and not self._rate.fault:  # samples may share a timestamp
             return
         leads = arrival_s - (self._last_s + step_s) < self._min_delay_s - MAX_LEAD_S
         if step_s <= 0.0 or (leads and step_s > elapsed_s + MAX_LEAD_S):  # otherwise the lead has grown slowly
@@ -229,7 +229,7 @@ class DeviceClock:
         self._device_s, self._arrival_s = device_s, arrival_s
         self._last_s += step_s
         delay_s = arrival_s - self._last_s
-        if not self.jumps and arrival_s - self._first_s <= START_S:
+        if not self.jumps and arrival_s - self._first_s <= MAX_FIRST_BACKLOG_S:
             self._min_delay_s = min(self._min_delay_s, delay_s)
         else:
             increased_s = self._min_delay_s + MAX_SLOWNESS * min(step_s, elapsed_s)

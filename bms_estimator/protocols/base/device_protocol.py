@@ -35,9 +35,9 @@ class DeviceProtocol(ABC):
     cells: CellBlock = NO_CELLS
     """Cell voltages of the samples that ``feed`` or ``feed_reads`` returned last [V]."""
     probes: ProbeBlock = NO_PROBES
-    """Temperature probes of the same samples; empty if the device has a single one that is never faulty."""
+    """Temperature probes of the last returned samples; empty if the device has a single one that is never faulty."""
     device_soc: Floats = NO_SOC
-    """SOC of the same samples by the device, 0..1, NaN without one; ``NO_SOC`` if it reports none."""
+    """SOC that the device reports with the last returned samples, 0..1, NaN without one; ``NO_SOC`` if it reports none."""
     device_capacity_ah: float = math.nan
     """Capacity from which the device computes its SOC, as last reported [Ah]; NaN: not reported."""
     probing: bool = False

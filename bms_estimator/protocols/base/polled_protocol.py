@@ -129,25 +129,25 @@ class PolledProtocol(ReadingProtocol):
         """Return the complete frames that end in ``data``; store an incomplete frame for the next call."""
         buffer = self._unparsed + data
         frames, parsed_end = list[bytes](), 0
-        incomplete = -1  # start of an incomplete frame; -1: none
+        incomplete_start = -1  # start of an incomplete frame; -1: none
         start = self._find_start(buffer, 0)
         while start >= 0:
             length = self._frame_length(buffer, start)
             if isinstance(length, int) and start + length > len(buffer):
                 length = ParseResult.MORE
             if isinstance(length, int) and self._has_valid_checksum(buffer[start : start + length]):
-                if incomplete >= 0:  # the frame that looked incomplete was cut off, because another one follows
+                if incomplete_start >= 0:  # the frame that looked incomplete was cut off, because another one follows
                     self._count_fault(
                         "short_frames", "a response was cut off: interference, or a second master on the line?"
                     )
                 self._skip(start - parsed_end)
-                parsed_end, incomplete = start + length, -1
+                parsed_end, incomplete_start = start + length, -1
                 frames.append(buffer[start:parsed_end])
                 start = self._find_start(buffer, parsed_end)
                 continue
-            if incomplete < 0:  # the bytes of an incomplete frame are parsed again with the next read
+            if incomplete_start < 0:  # the bytes of an incomplete frame are parsed again with the next read
                 if length is ParseResult.MORE:
-                    incomplete = start
+                    incomplete_start = start
                 elif length is ParseResult.LENGTH:
                     self._count_fault(
                         "length_errors", "responses with invalid lengths arrive: interference, or a wrong baud rate?"
@@ -159,7 +159,7 @@ class PolledProtocol(ReadingProtocol):
                     )
             start = self._find_start(buffer, start + 1)
         # without an incomplete frame, only the last bytes may be the beginning of a frame
-        end = incomplete if incomplete >= 0 else max(parsed_end, len(buffer) - MAX_START_BYTES + 1)
+        end = incomplete_start if incomplete_start >= 0 else max(parsed_end, len(buffer) - MAX_START_BYTES + 1)
         self._skip(end - parsed_end)
         self._unparsed = buffer[end:]
         return frames

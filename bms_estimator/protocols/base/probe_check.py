@@ -161,16 +161,16 @@ class _Probe:
         cooled_c = self._hot_c - COOLING_K_PER_S * (time_s - self._hot_s)
         possible = self._is_possible(time_s, reading_c) and reading_c >= cooled_c - COOLING_TOLERANCE_K
         if possible:
-            self._follow_heat(time_s, reading_c, cooled_c)
+            self._update_sustained(time_s, reading_c, cooled_c)
             self.credible_c, self._credible_s, self._doubted_c = reading_c, time_s, math.nan
         elif not math.isnan(reading_c):
             self._doubted_c = reading_c
         return possible
 
-    def _follow_heat(self, time_s: float, reading_c: float, cooled_c: float) -> None:
-        """Update the sustained temperature. ``cooled_c`` is the lowest one to which the probe can have cooled since then [C].
+    def _update_sustained(self, time_s: float, reading_c: float, cooled_c: float) -> None:
+        """Update the sustained temperature. Since the last one, the probe can have cooled to ``cooled_c`` [C] at the lowest.
 
-        A reading holds until the next one, so that slow sources are followed, too.
+        A reading counts until the next one, so that a source with a long period has a sustained temperature, too.
         """
         if math.isnan(self.credible_c):
             self._begin_s = time_s

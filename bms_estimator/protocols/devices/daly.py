@@ -72,7 +72,7 @@ class DalyProtocol(PolledProtocol):
 
     @property
     def description(self) -> str | None:
-        """Number of cells; None before it and a sample have arrived."""
+        """Number of cells; None until the number and a sample have arrived."""
         return f"Daly BMS, {self._cell_count} cells" if self._has_sample and self._cell_count is not None else None
 
     def on_port_opened(self) -> None:

@@ -125,5 +125,5 @@ DEVICE = Device(
     ),
     has_binary_frames=True,
 )
-"""One frame has voltage and current in steps of 10 mV and 10 mA. Users saw nothing below 0.2 A, and nothing below 0.5 A on one of
-120 A (github.com/smagicld/xiaoxiangBMS, issues 115 and 39)."""
+"""One frame has voltage and current in steps of 10 mV and 10 mA. Users saw no current below 0.2 A, and with a BMS for 120 A no
+current below 0.5 A (github.com/smagicld/xiaoxiangBMS, issues 115 and 39)."""

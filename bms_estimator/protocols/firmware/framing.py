@@ -303,7 +303,7 @@ def check_sequence(d: Record, sequence: int, board_us: int, arrival_s: float) ->
         behind = MODULUS - ahead if ahead >= _HALF else 0
         if d.reset_pending or behind > _REORDER_WINDOW:
             if not d.reset_pending:
-                require_new_hello(d, arrival_s)  # the hello after the reset was lost; the next one is no further reset
+                require_new_hello(d, arrival_s)  # the hello after the reset was lost; the next one is not a reset
             uptime_s = board_us * _US  # time since the reset
             if is_early(d, arrival_s, d.time_s + uptime_s):  # implausible, so that the arrival time alone counts
                 uptime_s = 0.0

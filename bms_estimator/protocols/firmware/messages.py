@@ -179,7 +179,7 @@ def relay_word(relay: Relay) -> int:
 
 @dataclass(frozen=True)
 class Hello:
-    """Hello: description that a board sends of itself, in the units of the line."""
+    """Description that a board sends of itself, in the units of the line."""
 
     firmware_major: int
     firmware_minor: int

@@ -43,7 +43,7 @@ class _PendingCommand(Command):
 
 @dataclass
 class _RelayCommand(_PendingCommand):
-    """Pending relay command. It is sent right after a requested hello, so that a board in another boot does not receive it."""
+    """Pending relay command. It is sent right after a requested hello, so that it does not reach a board after a reset."""
 
     changes_hello: bool = False
     hint: str = "; firmware before 0.2.0 has no relay pin"
