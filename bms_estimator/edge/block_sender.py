@@ -302,7 +302,7 @@ class BlockSender:
 
     async def _serve(self, connection: Connection) -> None:
         """Send and receive until the connection is lost or the edge closes."""
-        self._denied.begin()
+        self._denied.on_connected()
         try:
             rejected = await connection.subscribe(None, [self._request_topic])
             for topic, reason in rejected.items():
@@ -319,7 +319,7 @@ class BlockSender:
                 for task in transfers:
                     task.cancel()
         finally:
-            self._denied.end()
+            self._denied.on_disconnected()
 
     async def _receive(self, connection: Connection) -> None:
         while True:

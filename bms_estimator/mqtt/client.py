@@ -51,10 +51,10 @@ HINTS = {
 }
 """Causes and remedies by reason code. ``section`` is the settings section of the broker."""
 
-LOGIN = {134, 135}
+LOGIN_CODES = {134, 135}
 """Reason codes of a rejected connection with a wrong or missing user name or password."""
 
-FINAL = {
+FINAL_CODES = {
     135,  # not authorized
     144,  # topic name invalid
     149,  # packet too large
@@ -65,7 +65,7 @@ FINAL = {
 
 def is_final(reason: ReasonCode) -> bool:
     """Return True if a message with this reason will always be rejected."""
-    return reason.value in FINAL
+    return reason.value in FINAL_CODES
 
 
 def describe_reason(reason: ReasonCode, section: str) -> str:
@@ -146,13 +146,13 @@ class Client(aiomqtt.Client):
         timeouts: Timeouts,
         section: str,
     ) -> None:
-        limit = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
-        limit.MaximumPacketSize = options.max_bytes
+        connect_properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]  # paho has no types there
+        connect_properties.MaximumPacketSize = options.max_bytes
         self._section, self._is_5 = section, protocol is ProtocolVersion.V5
         super().__init__(
             **arguments,
             protocol=protocol,
-            properties=limit if self._is_5 else None,
+            properties=connect_properties if self._is_5 else None,
             identifier=options.identifier,
             will=aiomqtt.Will(*options.will) if options.will else None,
             keepalive=timeouts.keepalive_s,
@@ -164,11 +164,11 @@ class Client(aiomqtt.Client):
         self._acknowledge_s = timeouts.acknowledge_s
         self._client.on_log = self._on_log
         self.protocol = "MQTT 5" if self._is_5 else "MQTT 3.1.1"
-        self._answers: dict[int, asyncio.Future[PublishRejection | None]] = {}
+        self._pending_acks: dict[int, asyncio.Future[PublishRejection | None]] = {}
         self._in_flight = asyncio.Semaphore(self._client.max_inflight_messages)
         self._max_bytes: int | None = None
         self._abandoned = False
-        self._why = "the connection broke"
+        self._failure = "the connection broke"
 
     async def publish(self, message: Message) -> PublishRejection | None:  # type: ignore[override]
         """Publish as ``Connection`` specifies."""
@@ -185,7 +185,7 @@ class Client(aiomqtt.Client):
             if info.rc != MQTTErrorCode.MQTT_ERR_SUCCESS:
                 raise BrokerConnectionError(f"a message cannot be sent: {error_string(info.rc)}")
             answer: asyncio.Future[PublishRejection | None] = asyncio.get_running_loop().create_future()
-            self._answers[info.mid] = answer
+            self._pending_acks[info.mid] = answer
             self._client.loop_write()  # send now, because other tasks may run before the event loop finds the socket writable
             try:
                 await asyncio.wait([answer], timeout=self._acknowledge_s)
@@ -196,7 +196,7 @@ class Client(aiomqtt.Client):
                     )
                 return answer.result()
             finally:
-                self._answers.pop(info.mid, None)
+                self._pending_acks.pop(info.mid, None)
 
     async def subscribe(self, requests: str | None, others: Sequence[str]) -> dict[str, str]:  # type: ignore[override]
         """Subscribe as ``Connection`` specifies."""
@@ -220,7 +220,7 @@ class Client(aiomqtt.Client):
         try:
             message = await anext(self.messages)
         except aiomqtt.MqttError:
-            raise BrokerConnectionError(self._why) from None
+            raise BrokerConnectionError(self._failure) from None
         return ReceivedMessage(message.topic.value, bytes(message.payload), bool(message.retain))
 
     def abandon(self) -> None:
@@ -264,20 +264,20 @@ class Client(aiomqtt.Client):
         properties: Properties | None = None,
     ) -> None:
         if flags.is_disconnect_packet_from_server:
-            self._why = describe_reason(reason_code, self._section)
+            self._failure = describe_reason(reason_code, self._section)
         elif reason_code == "Keep alive timeout":
-            self._why = "the broker did not answer a ping"
+            self._failure = "the broker did not answer a ping"
         if self._abandoned:
             return
         if not self._connected.done():
-            self._connected.set_exception(ClosedError(self._why))
+            self._connected.set_exception(ClosedError(self._failure))
         if self._connected.cancelled():  # no caller waits, and the base class would raise CancelledError here
             return
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
 
     def _on_log(self, client: Any, userdata: Any, level: int, text: str) -> None:  # noqa: ARG002
         if text.startswith(SOCKET_ERROR_PREFIX):
-            self._why = text.removeprefix(SOCKET_ERROR_PREFIX)
+            self._failure = text.removeprefix(SOCKET_ERROR_PREFIX)
 
     def _on_socket_open(self, client: Any, userdata: Any, sock: Any) -> None:
         """Handle a new socket as the base class does. Shut down an abandoned socket: the event loop may be closing."""
@@ -300,7 +300,7 @@ class Client(aiomqtt.Client):
         self._loop.call_soon_threadsafe(watch)
 
     def _on_publish(self, client: Any, userdata: Any, mid: int, reason_code: ReasonCode, properties: Any) -> None:  # noqa: ARG002
-        answer = self._answers.get(mid)
+        answer = self._pending_acks.get(mid)
         if answer is not None and not answer.done():
             answer.set_result(
                 PublishRejection(describe_reason(reason_code, self._section), not is_final(reason_code))
@@ -344,7 +344,9 @@ def failure_reason(error: aiomqtt.MqttError, section: str) -> str:
 
 def is_login_error(error: aiomqtt.MqttError) -> bool:
     """Return True if the broker rejects user name and password, or requires them."""
-    return isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode) and error.rc.value in LOGIN
+    return (
+        isinstance(error, aiomqtt.MqttCodeError) and isinstance(error.rc, ReasonCode) and error.rc.value in LOGIN_CODES
+    )
 
 
 def should_retry_with_v311(error: aiomqtt.MqttError) -> bool:

@@ -62,7 +62,7 @@ class ConnectOptions(NamedTuple):
     """Client identifier, equal for all connections. The broker therefore closes an older connection and publishes its
     will before it accepts a new one."""
     will: Message | None
-    """Last will; None for a reader."""
+    """Last will; None for a client that only reads."""
     on_message_lost: Callable[[str, str], None]
     """Callback with kind (``too_long``, ``overflow``) and topic of each discarded message."""
     max_waiting: int = MAX_WAITING

@@ -28,15 +28,15 @@ class DeniedTopics:
         self._temporarily_denied: dict[str, None] = {}
         self._resend_timer: asyncio.TimerHandle | None = None
 
-    def begin(self) -> None:
+    def on_connected(self) -> None:
         """Clear the denied topics at the beginning of a connection."""
-        self.end()
+        self.on_disconnected()
         for topics in (self._logged, self._denied, self._temporarily_denied):
             topics.clear()
         self._update_stats()
         self._backoff.reset()
 
-    def end(self) -> None:
+    def on_disconnected(self) -> None:
         """Cancel a pending resend at the end of a connection."""
         if self._resend_timer is not None:
             self._resend_timer.cancel()

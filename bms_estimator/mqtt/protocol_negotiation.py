@@ -33,8 +33,7 @@ class BrokerConnector:
 
     def __init__(self, settings: BrokerSettings, timeouts: Timeouts = DEFAULT_TIMEOUTS) -> None:
         self._settings, self._timeouts = settings, timeouts
-        # URLs to try with MQTT 3.1.1 next, because MQTT 5 was rejected, or got no response: the broker is stopped, or too old
-        # to reject it
+        # URLs to try with MQTT 3.1.1 next: the broker rejected MQTT 5, or did not respond, as very old brokers do
         self._v311_urls: set[str] = set()
 
     @contextlib.asynccontextmanager
@@ -72,7 +71,7 @@ class BrokerConnector:
                 client = await stack.enter_async_context(
                     open_client(arguments, ProtocolVersion.V311, options, self._timeouts, self._settings.section)
                 )
-                self._v311_urls.add(url)  # a rejected attempt costs the broker a second TLS handshake
+                self._v311_urls.add(url)  # saves the rejected attempt and its TLS handshake next time
                 return client
         except TimeoutError:
             self._v311_urls ^= {url}  # try the other version next time

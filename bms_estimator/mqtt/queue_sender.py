@@ -30,8 +30,8 @@ class MessageQueue(Protocol):
     def dropped(self) -> int:
         """Number of messages dropped since start because the queue was full."""
 
-    async def take(self, most: int) -> Sequence[QueuedMessage]:
-        """Wait for a message, then return up to ``most`` of the oldest that were not returned since ``rewind``."""
+    async def take(self, max_count: int) -> Sequence[QueuedMessage]:
+        """Wait for a message, then return up to ``max_count`` of the oldest that were not returned since ``rewind``."""
 
     def acknowledge(self, number: int, rejection: str = "") -> None:
         """Record that the broker has acknowledged a message, or the reason why it has permanently rejected the message."""

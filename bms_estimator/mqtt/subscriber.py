@@ -26,7 +26,7 @@ LOSS_REASONS = {"too_long": f"longer than {MAX_BYTES} bytes", "overflow": "faste
 """Reasons for dropped messages, by their name in ``ConnectOptions.on_message_lost``."""
 LOG_S = 60.0
 """Minimum time between two log lines on dropped messages [s]."""
-CLOSING_S = 3.0
+SHUTDOWN_TIMEOUT_S = 3.0
 """Timeout of a disconnect from the broker [s]."""
 
 
@@ -41,7 +41,7 @@ class Subscriber:
         on_message: Called with each message of a device after it is stored.
         on_link_change: Called after the broker was connected or lost; ``lost_since`` distinguishes the two.
         connect: Opens a connection; default: over TCP.
-        on_hidden: Called with the name of a device that is not stored because there are too many.
+        on_hidden: Called with the name of a device that is not stored because there are too many; ``str`` does nothing.
         clock: Wall clock and monotonic clock.
         first_delay_s: Delay before a lost broker is retried [s]; it grows as in ``Backoff``.
 
@@ -122,7 +122,7 @@ class Subscriber:
         if self._task is None:
             return
         self._reconnect_loop.closing.set()
-        await finish(self._task, CLOSING_S)
+        await finish(self._task, SHUTDOWN_TIMEOUT_S)
 
     async def _serve(self, connection: Connection) -> None:
         """Receive until the connection is lost or the subscriber closes."""
@@ -140,7 +140,7 @@ class Subscriber:
     async def _receive(self, connection: Connection) -> None:
         while True:
             message = await connection.receive()
-            device_message = self._cache.take(message.topic, message.payload, self._clock.wall())
+            device_message = self._cache.add_message(message.topic, message.payload, self._clock.wall())
             if device_message is not None:
                 self._on_message(device_message)
 

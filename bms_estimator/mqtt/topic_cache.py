@@ -1,4 +1,4 @@
-"""Last messages of devices by topic, parsed. Pure: no connection, no clock.
+"""Last messages of devices by topic, parsed. It has neither a connection nor a clock.
 
 Any client may publish anything, so the memory is bounded and payloads of any kind are accepted.
 """
@@ -79,7 +79,7 @@ class TopicCache:
         """Number of devices that publish but are not stored, at most ``MAX_HIDDEN``."""
         return len(self._hidden)
 
-    def take(self, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
+    def add_message(self, topic: str, payload: bytes, now_s: float) -> DeviceMessage | None:
         """Store a message.
 
         Args:

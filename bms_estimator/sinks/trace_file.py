@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bms_estimator.model.errors import UserError
 
 GZIP_LEVEL = 3
-"""Compression level of gzip. It takes a third of the time of level 9 and gives files larger by some percent."""
+"""Compression level of gzip. It takes a third of the time of level 9, and the files are a few percent larger."""
 
 
 class TableSink(Protocol):
@@ -70,8 +70,8 @@ class CsvSink:
         file = self._files.enter_context(_create(self._path))
         if self._path.suffix.lower() != ".gz":
             return file
-        packed = gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=GZIP_LEVEL)
-        return self._files.enter_context(cast("IO[bytes]", packed))
+        gzip_file = gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=GZIP_LEVEL)
+        return self._files.enter_context(cast("IO[bytes]", gzip_file))
 
 
 class ParquetSink:

@@ -42,7 +42,7 @@ def test_each_request_is_counted_and_answered_with_json(data: bytes) -> None:
 def test_published_messages_are_shown_as_printable_text_only(data: bytes) -> None:
     cache = TopicCache("bms")
     for topic in TOPICS:
-        message = cache.take(f"bms/pack/{topic}", data, 0.0)
+        message = cache.add_message(f"bms/pack/{topic}", data, 0.0)
         line = text_line(message) if message else None
         assert line is None or line.isprintable()
     if data:

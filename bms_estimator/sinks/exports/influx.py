@@ -86,11 +86,11 @@ def _epoch_ms(iso: str) -> int:
 
 MAX_WAITING = 10_000
 """Maximum number of queued lines. With one state a second they last almost three hours; then the oldest is dropped."""
-BATCH = 1000
+BATCH_LINES = 1000
 """Maximum number of lines in a request of about a megabyte."""
 RESPONSE_TIMEOUT_S = 10.0
 """Timeout of a server response [s]."""
-CLOSING_S = 3.0
+SHUTDOWN_TIMEOUT_S = 3.0
 """Timeout of the last request [s]."""
 PERMANENT_ERRORS = (400, 413, 422)
 """HTTP status codes for lines that the server will never accept. After any other code the lines are sent again."""
@@ -155,7 +155,7 @@ class InfluxSink:
         while len(self._queue) > MAX_WAITING:
             self._queue.popleft()
             self.dropped += 1
-        if len(self._queue) >= BATCH:
+        if len(self._queue) >= BATCH_LINES:
             self._batch_is_full.set()
 
     async def __aenter__(self) -> Self:
@@ -164,12 +164,12 @@ class InfluxSink:
         return self
 
     async def __aexit__(self, *_error: object) -> None:
-        """Send the queued lines within ``CLOSING_S``."""
+        """Send the queued lines within ``SHUTDOWN_TIMEOUT_S``."""
         if self._task is None:
             return
         self._closing.set()
         self._batch_is_full.set()
-        await finish(self._task, CLOSING_S)
+        await finish(self._task, SHUTDOWN_TIMEOUT_S)
 
     async def _run(self) -> None:
         """Send queued lines every ``every_s``, or sooner if a batch is full.
@@ -195,7 +195,7 @@ class InfluxSink:
         """Send batches until the queue is empty. Return False if the server must be retried."""
         loop = asyncio.get_running_loop()
         while self.waiting:
-            while self._queue and len(self._batch) < BATCH:
+            while self._queue and len(self._batch) < BATCH_LINES:
                 self._batch.append(self._queue.popleft())
             try:
                 await loop.run_in_executor(self._thread, partial(_post, self._settings, "\n".join(self._batch)))

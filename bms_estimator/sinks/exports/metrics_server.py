@@ -11,7 +11,7 @@ from prometheus_client.registry import Collector
 
 from bms_estimator.process.listener import CONNECTIONS, Listener
 
-CLOSING_S = 1.0
+SHUTDOWN_TIMEOUT_S = 1.0
 """Shutdown timeout of open connections [s]."""
 
 
@@ -42,7 +42,7 @@ class MetricsServer:
         server = web.Server(self._answer)
         listener = Listener(server)
         await listener.open_or_retry(self._host, self._port, "metrics")
-        self._stack.push_async_callback(server.shutdown, CLOSING_S)
+        self._stack.push_async_callback(server.shutdown, SHUTDOWN_TIMEOUT_S)
         self._stack.push_async_callback(listener.close)
         return self
 

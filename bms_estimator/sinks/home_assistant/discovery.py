@@ -28,7 +28,7 @@ MIN_EXPIRY_S = 30
 _ALARM_CLASSES: Mapping[str, str] = {name: kind.device_class for name, kind in ALARM_KINDS.items()}
 _ALARM_AVAILABILITY = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
 """Template of an alarm's availability. A raised alarm stays available even if its quantity is lost later."""
-FORMER = ("r_s_ohm",)
+FORMER_SENSORS = ("r_s_ohm",)
 """Keys of sensors of former versions, which Home Assistant removes."""
 _SOC_HINT = "{{ {'hint': '' if value_json.soc_percent is number else 'not known yet: charge the pack to full once, or let it rest for ten minutes'} | tojson }}"
 """Template of the attribute that says what helps while the state of charge is not known."""
@@ -131,7 +131,9 @@ def _removed_components(inputs: DiscoveryInputs) -> dict[str, dict[str, str]]:
 
     Home Assistant removes a component if the message contains only its platform.
     """
-    platforms = {f"alarm_{name}": "binary_sensor" for name in inputs.unwatched} | dict.fromkeys(FORMER, "sensor")
+    platforms = {f"alarm_{name}": "binary_sensor" for name in inputs.unwatched} | dict.fromkeys(
+        FORMER_SENSORS, "sensor"
+    )
     platforms |= {name: control("")["platform"] for name, control in _COMMANDS.items() if name not in inputs.commands}
     return {key: {"platform": platform} for key, platform in platforms.items()}
 

@@ -1,4 +1,4 @@
-"""Builder of MQTT messages from a snapshot and the state already published. Pure: no connection, no clock.
+"""Builder of MQTT messages from a snapshot and the state already published. It has neither a connection nor a clock.
 
 A value for Home Assistant is published if it has changed enough and its minimum interval has passed. Home Assistant's
 recorder writes a row for each published value. Therefore the number of values a minute is limited. If more entities

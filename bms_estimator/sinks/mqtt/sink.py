@@ -63,7 +63,7 @@ class AvailabilityMonitor:
         self._is_wrong = False  # another client has overwritten an availability
         self._corrected_s = -math.inf
 
-    def begin(self) -> None:
+    def on_connected(self) -> None:
         """Reset for a new connection, on which both availabilities are published again."""
         self._echoed.clear()
         self._is_wrong = False
@@ -86,8 +86,7 @@ class AvailabilityMonitor:
     async def correct(self, publish: Callable[[Sequence[Message]], Awaitable[None]]) -> None:
         """Publish the correct messages if an availability is wrong and ``CORRECTION_S`` has passed.
 
-        A second service of the pack, which writes the availability at its end, has also overwritten the alarms.
-
+        The alarms are published, too, because a second service of the pack overwrites them before it ends.
         The correction is counted only after the broker's acknowledgment. A broker that shuts down publishes the will,
         which looks like another client's message, and acknowledges nothing.
         """
@@ -120,9 +119,9 @@ class AvailabilityMonitor:
 BIRTH_DELAY_S = 2.0
 """Delay from Home Assistant's birth message to the retained messages [s], because Home Assistant subscribes some time
 after its birth message."""
-HANDOVER_S = 2.0
+QUEUE_DRAIN_TIMEOUT_S = 2.0
 """Time limit for sending queued messages at shutdown [s]."""
-CLOSING_S = 3.0
+SHUTDOWN_TIMEOUT_S = 3.0
 """Timeout of the whole shutdown [s]."""
 
 log = structlog.get_logger(__name__)
@@ -179,7 +178,7 @@ class MqttSink:
         options = ConnectOptions(identifier, will, lambda kind, topic: requests.count_refusal(kind, topic[:MAX_SHOWN]))
         for warning in check(settings):
             log.warning("secret is readable by other users", reason=warning)
-        self._link = ReconnectLoop(
+        self._reconnect_loop = ReconnectLoop(
             brokers(settings), options, connect or BrokerConnector(settings), self._serve, delivery, first_delay_s
         )
         self._unsent: Snapshot | None = None
@@ -206,25 +205,25 @@ class MqttSink:
 
     async def __aenter__(self) -> Self:
         """Start connecting to the broker."""
-        self._task = asyncio.create_task(self._link.run(), name="mqtt")
+        self._task = asyncio.create_task(self._reconnect_loop.run(), name="mqtt")
         return self
 
     async def __aexit__(self, *_error: object) -> None:
         """Publish queued messages and ``offline``, then disconnect.
 
-        If this takes longer than ``CLOSING_S``, the connection is dropped and the broker publishes the will.
+        If this takes longer than ``SHUTDOWN_TIMEOUT_S``, the connection is dropped and the broker publishes the will.
         """
         if self._task is None:
             return
-        self._link.closing.set()
+        self._reconnect_loop.closing.set()
         self._wake.set()
-        await finish(self._task, CLOSING_S)
+        await finish(self._task, SHUTDOWN_TIMEOUT_S)
 
     async def _serve(self, connection: Connection) -> None:
         """Send and receive until the connection is lost or the sink closes."""
         self._resend_retained = True  # the broker may have lost the retained messages
-        self._denied.begin()
-        self._availability.begin()
+        self._denied.on_connected()
+        self._availability.on_connected()
         try:
             async with asyncio.TaskGroup() as tasks:
                 others = [tasks.create_task(self._receive(connection))]
@@ -237,7 +236,7 @@ class MqttSink:
                 for task in others:
                     task.cancel()
         finally:
-            self._denied.end()
+            self._denied.on_disconnected()
 
     async def _subscribe(self, connection: Connection) -> None:
         """Subscribe, and report what the broker denies.
@@ -273,9 +272,9 @@ class MqttSink:
                 self._messages.commands = self._requests.allowed
                 messages, self._sent = self._messages.live_messages(self._sent, snapshot, now_s)
                 await self._publish(connection, messages)
-            if self._link.closing.is_set():
+            if self._reconnect_loop.closing.is_set():
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(HANDOVER_S):
+                    async with asyncio.timeout(QUEUE_DRAIN_TIMEOUT_S):
                         await self._outbox_sender.wait_until_empty()
                 await self._publish(connection, self._messages.offline_messages())
                 return
@@ -323,10 +322,10 @@ class OutboxSender(QueueSender):
 
     def __init__(self, outbox: Outbox, delivery: DeliveryStats, denied: DeniedTopics, first_delay_s: float) -> None:
         super().__init__(outbox, delivery, denied, first_delay_s)
-        self._filled = outbox
+        self._outbox_to_fill = outbox
 
     def put(self, messages: Iterable[Message], on_result: OnResult | None = None) -> None:
         """Queue messages until the broker acknowledges them. ``on_result`` receives the result of each."""
         for message in messages:
-            self._filled.put(message, on_result)
+            self._outbox_to_fill.put(message, on_result)
         self._update_stats()

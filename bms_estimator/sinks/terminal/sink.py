@@ -68,7 +68,7 @@ REDRAW_S = 0.25
 """Minimum interval between two screens, at any publish rate [s]."""
 MAX_WAITING_LINES = 1000
 """Maximum number of lines that wait for a blocked pipe. Beyond it, the oldest line is dropped."""
-CLOSE_S = 2.0
+SHUTDOWN_TIMEOUT_S = 2.0
 """Timeout of the last write to a blocked terminal [s]."""
 
 
@@ -116,7 +116,7 @@ class LiveView:
         """Restore the terminal and print the last screen once more."""
         self._closing.set()
         self._draw_event.set()
-        await asyncio.to_thread(self._thread.join, CLOSE_S)
+        await asyncio.to_thread(self._thread.join, SHUTDOWN_TIMEOUT_S)
 
     def on_message(self, message: DeviceMessage) -> None:
         """Queue the line of a message, if standard output is no terminal."""
@@ -235,7 +235,7 @@ class TerminalSink:
             OSError: Standard output could not be written.
         """
         for message in self._messages(snapshot):
-            received = self._cache.take(message.topic, message.payload, self._clock.wall())
+            received = self._cache.add_message(message.topic, message.payload, self._clock.wall())
             if received is not None:
                 self._view.on_message(received)
         self._view.show()

@@ -15,7 +15,7 @@ import structlog
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.exports import InfluxSettings
-from bms_estimator.sinks.exports.influx import BATCH, MAX_WAITING, InfluxSink, lines
+from bms_estimator.sinks.exports.influx import BATCH_LINES, MAX_WAITING, InfluxSink, lines
 from tests.influxdb import InfluxDB
 from tests.patience import until
 from tests.sinks.snapshots import CELL_SNAPSHOT, SNAPSHOT_WITHOUT_SAMPLES, SOC_LOW_ALARM
@@ -150,17 +150,19 @@ async def test_queue_is_bounded_and_sent_in_batches(server: Any) -> None:
     async with sink(server.url) as influx:
         influx.publish(snapshot_at(0))
         await until(lambda: server.requests)
-        for second in range(1, MAX_WAITING + 2 * BATCH):
+        for second in range(1, MAX_WAITING + 2 * BATCH_LINES):
             influx.publish(snapshot_at(second % 3600))
-        assert influx.waiting <= MAX_WAITING + BATCH
-        assert influx.dropped >= BATCH - 1
+        assert influx.waiting <= MAX_WAITING + BATCH_LINES
+        assert influx.dropped >= BATCH_LINES - 1
         server.responses = [(204, b"")]
         await until(lambda: not influx.waiting)
-    assert max(body.count(b"\n") + 1 for _, _, body in server.requests) <= BATCH
+    assert max(body.count(b"\n") + 1 for _, _, body in server.requests) <= BATCH_LINES
 
 
 async def test_server_without_response_does_not_block_shutdown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)  # the last lines cannot be written
+    monkeypatch.setattr(
+        "bms_estimator.sinks.exports.influx.SHUTDOWN_TIMEOUT_S", 0.2
+    )  # the last lines cannot be written
     with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel accepts connections, but no program responds
         async with sink(f"http://127.0.0.1:{silent.getsockname()[1]}") as influx:
             for second in range(20):
@@ -169,7 +171,9 @@ async def test_server_without_response_does_not_block_shutdown(monkeypatch: pyte
 
 
 async def test_truncated_response_is_retried(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bms_estimator.sinks.exports.influx.CLOSING_S", 0.2)  # the last lines cannot be written
+    monkeypatch.setattr(
+        "bms_estimator.sinks.exports.influx.SHUTDOWN_TIMEOUT_S", 0.2
+    )  # the last lines cannot be written
     with socket.create_server(("127.0.0.1", 0)) as listening:
 
         def send_truncated_response() -> None:

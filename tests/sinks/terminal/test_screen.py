@@ -36,7 +36,7 @@ def pack_view(topics: dict[str, Any] | None = None, snapshot: Snapshot = CELL_SN
         *messages.guaranteed_messages(None, snapshot),
         *messages.live_messages(PublishedState(), snapshot, NOW)[0],
     ):
-        published.take(message.topic, message.payload, NOW)
+        published.add_message(message.topic, message.payload, NOW)
     return PackView("pack", published.devices["pack"].topics | {"sensor/availability": "online"} | (topics or {}))
 
 
