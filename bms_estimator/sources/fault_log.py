@@ -8,7 +8,7 @@ import structlog
 MIN_LOG_INTERVAL_S = 30.0
 """Minimum interval between two log lines on faults, or on one reason [s]."""
 MAX_REASONS = 16
-"""Maximum number of reasons that are logged without a minimum interval. More reasons are noise in a device's text."""
+"""Maximum number of stored reasons. Noise in a device's text makes new reasons; the log of further ones is rate-limited."""
 _NORMAL_EVENTS = (
     "bytes_received",
     "unadmitted_bytes",

@@ -24,7 +24,7 @@ CHECK_INTERVAL_S = 1.0
 SILENT_PERIODS = 3.0
 """Number of sample periods without a sample after which a source counts as silent."""
 NO_SAMPLE_YET = "connected, no sample yet"
-"""Reason for silence after a connection, unless producer or decoder know a fault."""
+"""Reason for silence after a connection, unless the producer or the decoder reports a fault."""
 
 log = structlog.get_logger(__name__)
 
@@ -80,7 +80,7 @@ class LineSource:
         producer: Connects to the device and yields its lines.
         sensor: Sign of the current; ``protocol`` must be ``text``.
         period_s: Expected sample period [s].
-        tap: Receives a copy of each arrival time and line that the decoder is fed.
+        tap: Receives each line with its arrival time, before the line is decoded.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
         first_retry_s: First delay before a missing or lost device is retried [s]. Each attempt doubles the delay.

@@ -18,15 +18,15 @@ TEMPERATURES = "temperature_c", "temperature_min_c", "temperature_max_c"
 """Fields of a sample with temperatures."""
 DeviceSource = LineSource | SerialSource
 """Source with one device."""
-MAX_PERIODS, MIN_AGE_S = 3.0, 10.0
-"""Maximum age of the values of the BMS: in its sample periods, and its minimum [s]."""
+MAX_AGE_PERIODS, MAX_AGE_FLOOR_S = 3.0, 10.0
+"""Maximum age of the values of the BMS [sample periods of the BMS], and the lower limit of this maximum [s]."""
 
 
 class PairedSource:
     """Samples of a battery monitor with the latest cell voltages and temperatures of a BMS.
 
-    Without new values of the BMS, the samples have no cell voltages after a while, and the temperature of the monitor. An SOC by
-    the monitor takes precedence over that by the BMS.
+    If the values of the BMS are too old, the samples have no cell voltages, and the temperature is that of the monitor. An SOC
+    from the monitor takes precedence over one from the BMS.
 
     Args:
         monitor: Battery monitor.
@@ -43,7 +43,7 @@ class PairedSource:
         monotonic: Callable[[], float] = since_boot,
     ) -> None:
         self._monitor, self._bms, self._monotonic = monitor, bms, monotonic
-        self._max_age_s = max(MAX_PERIODS * period_s, MIN_AGE_S)
+        self._max_age_s = max(MAX_AGE_PERIODS * period_s, MAX_AGE_FLOOR_S)
         self._latest: ReceivedSamples | None = None
         self._latest_s = -math.inf
         self._task: asyncio.Task[None] | None = None
@@ -105,7 +105,7 @@ class PairedSource:
 
     def _with_bms(self, received: ReceivedSamples) -> ReceivedSamples:
         """Return samples with the cell voltages, temperatures, SOC and capacity of the BMS, unless they are too old."""
-        bms, rows = self._latest, np.zeros(received.samples.size, int)
+        bms, last_rows = self._latest, np.full(received.samples.size, -1)
         if bms is None or self._monotonic() - self._latest_s > self._max_age_s:
             return received
         samples, last = received.samples.copy(), bms.samples[-1]
@@ -115,11 +115,11 @@ class PairedSource:
             samples["status"] |= last["status"] & np.uint32(SampleStatus.PROBE_FAULT)
         soc, capacity_ah = received.device_soc, received.device_capacity_ah
         if not np.isfinite(soc).any():
-            soc = bms.device_soc[-1:][rows] if bms.device_soc.size else NO_SOC
+            soc = bms.device_soc[last_rows] if bms.device_soc.size else NO_SOC
         return ReceivedSamples(
             samples,
-            bms.cells_v[-1:][rows] if bms.cells_v.size else received.cells_v,
-            bms.probes[-1:][rows] if bms.probes.size else received.probes,
+            bms.cells_v[last_rows] if bms.cells_v.size else received.cells_v,
+            bms.probes[last_rows] if bms.probes.size else received.probes,
             soc,
             bms.device_capacity_ah if math.isnan(capacity_ah) else capacity_ah,
         )

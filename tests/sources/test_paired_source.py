@@ -50,8 +50,8 @@ class Devices:
 
 @pytest.fixture
 def devices(monkeypatch: pytest.MonkeyPatch) -> Iterator[Devices]:
-    monkeypatch.setattr(paired_source, "MIN_AGE_S", 1.0)
-    monkeypatch.setattr(paired_source, "MAX_PERIODS", 0.5)
+    monkeypatch.setattr(paired_source, "MAX_AGE_FLOOR_S", 1.0)
+    monkeypatch.setattr(paired_source, "MAX_AGE_PERIODS", 0.5)
     devices = Devices()
     yield devices
     devices.close()

@@ -135,7 +135,7 @@ class BatchReader:
         finder = LayoutFinder(_TABLE_NAME, self._column_map)
         layout = finder.find(header)
         if layout is None:
-            raise finder.no_header()
+            raise finder.no_header_error()
         roles: dict[ColumnRole, Column] = {
             role: Column(column.index, header[column.index], column.unit, column.assumed)
             for role, column in layout.columns.items()

@@ -1,4 +1,4 @@
-"""Readings of the samples of aiobmsble, apart from the client, which needs this optional package."""
+"""Conversion of aiobmsble's samples to readings. This module does not import the optional package."""
 
 import math
 from collections.abc import Mapping

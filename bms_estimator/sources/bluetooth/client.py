@@ -133,7 +133,7 @@ class BleProducer(LineProducer):
         Raises:
             SourceUnavailableError: The BMS does not advertise, or aiobmsble does not recognize it.
         """
-        advertisements: list[AdvertisementData] = []  # only the latest; at the end that of the BMS
+        advertisements: list[AdvertisementData] = []  # only the latest; when the BMS is found, its own
 
         def is_wanted(device: BLEDevice, advertisement: AdvertisementData) -> bool:
             advertisements[:] = [advertisement]

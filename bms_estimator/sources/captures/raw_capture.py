@@ -13,8 +13,8 @@ File format, version 1, numbers little-endian::
              bytes
              u16      CRC-16/CCITT-FALSE of the record up to here
 
-Each read of the line is one record, up to the end of the file. The file is only appended to, with one system call for
-each record. After a crash of the recorder all complete records are valid, and an incomplete last one is ignored. A file may be
+After the header, each read of the line is one record. The file is only appended to, with one system call for each record.
+After a crash of the recorder all complete records are valid, and an incomplete last one is ignored. A file may be
 compressed with gzip.
 """
 
@@ -90,7 +90,7 @@ _VERSION_ADAPTER, _HEADER_ADAPTER = TypeAdapter(_HeaderVersion), TypeAdapter(Cap
 
 
 def make_header(sensor: SensorSettings, source: BaseSource | None = None) -> CaptureHeader:
-    """Return the header of a capture of ``source``; None: of the serial device of ``sensor``."""
+    """Return the header of a capture of ``source``, or of the serial device of ``sensor`` if ``source`` is None."""
     if source is not None:
         device = CaptureHeader(sensor.protocol, source.short_description)
     else:
@@ -133,7 +133,7 @@ class CaptureBatch:
     data: NDArray[np.uint8]
     """Concatenated bytes of the reads."""
     damaged: bool
-    """The record after this batch is damaged."""
+    """True if the record after this batch is damaged."""
     unread_bytes: int = 0
     """Number of bytes of an incomplete record at the end of the file."""
 
@@ -278,9 +278,9 @@ def _split(raw: NDArray[np.uint8]) -> tuple[CaptureBatch, int]:
 
 def _open(path: Path) -> IO[bytes]:
     file = path.open("rb")
-    is_packed = file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
+    is_gzip = file.read(len(GZIP_MAGIC)) == GZIP_MAGIC
     file.seek(0)
-    if not is_packed:
+    if not is_gzip:
         return file
     file.close()
     return cast("IO[bytes]", gzip.open(path))

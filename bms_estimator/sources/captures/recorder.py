@@ -17,7 +17,7 @@ from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWri
 SYNC_S = 5.0
 """Interval between two syncs to disk [s]. A power failure loses at most the data since the last sync."""
 MAX_QUEUED_CHUNKS = 1 << 16
-"""Maximum number of chunks that wait for the disk. They last about a minute at 1000 chunks per second."""
+"""Maximum number of chunks that wait for the disk. At 1000 chunks per second the queue fills in about a minute."""
 SHUTDOWN_TIMEOUT_S = 5.0
 """Timeout at shutdown [s]. The recorder waits while the disk completes at least one chunk within this time."""
 

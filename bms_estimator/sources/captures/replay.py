@@ -21,7 +21,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES
 from bms_estimator.sources.captures.raw_capture import is_capture, read_capture, read_sensor_settings
 from bms_estimator.sources.captures.tables.column_tables import ColumnTable
-from bms_estimator.sources.captures.tables.current_sign import Sign
+from bms_estimator.sources.captures.tables.current_sign import UserSign
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 from bms_estimator.sources.captures.tables.table_reader import convert_table, open_table
 from bms_estimator.sources.source import ReceivedSamples
@@ -130,7 +130,7 @@ class RawCapture:
 
 
 def no_samples_error(path: object, capture: Capture) -> UserError:
-    """Return the error for a capture without a sample. It names the fault of the bytes, which are read again."""
+    """Return the error for a capture without a sample. The capture is read again to find the fault of its bytes."""
     for _ in capture:
         pass
     fault = capture.decoder.fault if isinstance(capture, RawCapture) else None
@@ -290,7 +290,7 @@ def open_capture(
     if is_capture(path):
         return RawCapture(path, sensor, current_sign)
     has_sign = sensor is not None and not sensor.model_fields_set.isdisjoint({"current_sign", "protocol"})
-    return open_table(path, Sign(current_sign, sensor.current_sign if sensor and has_sign else None), column_map)
+    return open_table(path, UserSign(current_sign, sensor.current_sign if sensor and has_sign else None), column_map)
 
 
 def _why_no_file(path: Path) -> str:
@@ -329,7 +329,7 @@ def load_capture(
     if isinstance(source, str | Path):
         name, capture = Path(source).name, open_capture(Path(source), current_sign=current_sign, column_map=column_map)
     else:
-        name, capture = "capture", convert_table(source, Sign(current_sign), column_map)
+        name, capture = "capture", convert_table(source, UserSign(current_sign), column_map)
     return Columns(read_samples(capture), name, capture.note, capture.warning)
 
 

@@ -64,7 +64,7 @@ class CanProducer(LineProducer):
         if self._is_bus_off:
             return "the controller is bus off: are bitrate, wiring and termination right?"
         missing = self._decoder.missing
-        return missing and f"connected, but nothing comes of {missing}: are identifiers, bitrate and wiring right?"
+        return missing and f"connected, but without {missing}: are identifiers, bitrate and wiring right?"
 
     async def iter_lines(self) -> AsyncGenerator[bytes, None]:
         """Yield one line for each pair of voltage and current."""

@@ -21,7 +21,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.modbus import MAX_WORDS, ModbusSource, Register
 from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 
-GAP_WORDS = 8
+MAX_GAP_WORDS = 8
 """Maximum gap of unused registers in one request. One request reads the values on both sides at the same moment.
 8 unused registers (16 bytes) take less time than a second request."""
 DECIMALS = 5
@@ -57,7 +57,7 @@ class Request(NamedTuple):
     """Values in the request, by address."""
 
     @property
-    def described(self) -> str:
+    def description(self) -> str:
         """Description as text, e.g. ``source.voltage, source.current (holding registers 259 to 261)``."""
         quantities = ", ".join(dict.fromkeys(f"source.{value.quantity}" for value in self.values))
         last = f" to {self.address + self.words - 1}" if self.words > 1 else ""
@@ -75,17 +75,19 @@ def list_values(settings: ModbusSource) -> tuple[RegisterQuantity, ...]:
     return tuple(values)
 
 
-def plan_requests(values: Sequence[RegisterQuantity], *, gap: int = GAP_WORDS) -> tuple[Request, ...]:
+def plan_requests(values: Sequence[RegisterQuantity], *, max_gap: int = MAX_GAP_WORDS) -> tuple[Request, ...]:
     """Return the requests that read ``values``, as few as possible.
 
-    A request reads one table, at most ``MAX_WORDS`` registers, and at most ``gap`` unused registers between two values.
+    A request reads one table, at most ``MAX_WORDS`` registers, and at most ``max_gap`` unused registers between two values.
     """
     requests: list[Request] = []
     for value in sorted(values, key=lambda value: (value.register.table, value.register.address)):
         register, end = value.register, value.register.address + value.register.words
         if requests:
             previous = requests[-1]
-            is_near = previous.table == register.table and register.address <= previous.address + previous.words + gap
+            is_near = (
+                previous.table == register.table and register.address <= previous.address + previous.words + max_gap
+            )
             if is_near and end - previous.address <= MAX_WORDS:
                 words = max(previous.words, end - previous.address)
                 requests[-1] = previous._replace(words=words, values=(*previous.values, value))
@@ -103,7 +105,7 @@ def split_request(request: Request) -> tuple[Request, ...]:
     return tuple(
         part
         for quantity in quantities
-        for part in plan_requests([value for value in request.values if value.quantity == quantity], gap=0)
+        for part in plan_requests([value for value in request.values if value.quantity == quantity], max_gap=0)
     )
 
 
@@ -232,7 +234,7 @@ class ModbusProducer(LineProducer):
         except (ValueError, termios.error) as error:  # from pyserial: invalid baud rate, or not a serial port
             raise SourceUnavailableError(f"{failure}: {error}") from None
 
-    def _line(self, words: Mapping[tuple[Table, int], int]) -> bytes | None:
+    def _line(self, words: Words) -> bytes | None:
         """Return the line of a sample; None without voltage or current."""
         reading = decode_reading(self._values, words)
         if reading is None:
@@ -249,7 +251,7 @@ class ModbusProducer(LineProducer):
             capacity_ah=reading.capacity_ah,
         )
 
-    async def _read(self, client: Client) -> Mapping[tuple[Table, int], int]:
+    async def _read(self, client: Client) -> Words:
         """Read the registers of all quantities.
 
         Raises:
@@ -283,13 +285,13 @@ class ModbusProducer(LineProducer):
             if not any(value.is_required for value in request.values):
                 self._log_omitted(request, error)
                 return ()
-        raise SourceUnavailableError(f"{request.described}: {error}")
+        raise SourceUnavailableError(f"{request.description}: {error}")
 
     def _log_omitted(self, request: Request, error: _ExceptionResponseError) -> None:
         """Log an omitted request, unless it was logged before."""
-        if request.described not in self._logged_omissions:
-            self._logged_omissions.add(request.described)
-            log.warning("quantity omitted", source=self.name, failure=request.described, reason=str(error))
+        if request.description not in self._logged_omissions:
+            self._logged_omissions.add(request.description)
+            log.warning("quantity omitted", source=self.name, failure=request.description, reason=str(error))
 
     async def _request(self, client: Client, request: Request) -> Sequence[int]:
         """Send a request, and return the register contents.
@@ -304,13 +306,13 @@ class ModbusProducer(LineProducer):
         except ModbusException:
             timeout_s = self._settings.timeout_s
             raise SourceUnavailableError(
-                f"no response within {timeout_s:g} s to a request of {request.described}"
+                f"no response within {timeout_s:g} s to a request of {request.description}"
             ) from None
         if answer.isError():
             raise _ExceptionResponseError(answer.exception_code)
         if len(answer.registers) != request.words:
             raise SourceUnavailableError(
-                f"{len(answer.registers)} registers received, {request.words} requested for {request.described}"
+                f"{len(answer.registers)} registers received, {request.words} requested for {request.description}"
             )
         return answer.registers
 

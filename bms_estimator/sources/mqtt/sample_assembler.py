@@ -20,16 +20,16 @@ from bms_estimator.sources.mqtt.publisher_conflict import MIN_JUMPS, PublisherCo
 
 REQUIRED_QUANTITIES = ("voltage", "current")
 """Quantities without which there is no sample."""
-TIMED_QUANTITIES = (*REQUIRED_QUANTITIES, "time")
-"""Quantities whose values always become too old."""
+EXPIRING_QUANTITIES = (*REQUIRED_QUANTITIES, "time")
+"""Quantities whose values expire even if the publisher is online and sends only changes."""
 MAX_RETAINED = 1000
 """Maximum number of retained messages that wait for the status of the publisher."""
 REPEAT_PERIODS = 1.5
 """Time without a message after which the last current is used again if the publisher sends only changes, in sample periods. A
 regular message may be half a period late."""
 REGULAR_MESSAGES = 10
-"""Number of successive messages with a temperature or cell voltage after which its absence from a message means that it is no
-longer measured. A publisher that sends only a part of its values in each message rarely reaches it."""
+"""Number of successive messages with a temperature or cell voltage after which a message without it shows that the sensor is
+lost. A publisher that sends only a part of its values in each message rarely reaches this number."""
 MAX_PROBE_NUMBER = 32
 """Highest number of a temperature probe in a path or topic."""
 MAX_STATUS_CHARACTERS = 80
@@ -204,7 +204,7 @@ class SampleAssembler:
         for binding, match in bindings:
             number = int(match[1]) if match.re.groups else None
             try:
-                self._store_values(binding, _read(binding, payload, number), now_s)
+                self._store_values(binding, _read_values(binding, payload, number), now_s)
             except InvalidValueError as error:
                 location = binding.quantity, binding.location_index
                 keys = [key for key in self._values if key[:2] == location and number in (None, key[2])]
@@ -257,20 +257,20 @@ class SampleAssembler:
             if 1 <= number <= highest and not math.isnan(value):
                 key = (*location, number)
                 messages = self._values[key].messages + 1 if key in self._values else 1
-                lasts = self._sends_only_changes and self._is_online and binding.quantity not in TIMED_QUANTITIES
-                expiry_s = math.inf if lasts else now_s + self._max_age_s[binding.quantity]
+                permanent = self._sends_only_changes and self._is_online and binding.quantity not in EXPIRING_QUANTITIES
+                expiry_s = math.inf if permanent else now_s + self._max_age_s[binding.quantity]
                 self._values[key] = _StoredValue(value, now_s, expiry_s, messages)
         if binding.quantity in REQUIRED_QUANTITIES:
             self._unused_arrival_s.setdefault(binding.quantity, now_s)
 
     def _set_absent(self, location: tuple[str, int], keys: Iterable[_Key], *, is_null: bool) -> None:
-        """Let temperatures or cell voltages expire earlier that a message lacks, unless the publisher often omits them.
+        """Let temperatures and cell voltages that a message lacks expire earlier, unless the publisher often omits them.
 
         Args:
             location: Quantity and index of its location.
             keys: Keys of the values that the message lacks.
-            is_null: True if the message has null or another invalid value in their place, which is a loss unless an earlier
-                message lacked the quantity, too. An absent key is a loss only after ``REGULAR_MESSAGES``.
+            is_null: True if the message has null or another invalid value in their place. Null means that the sensor is lost,
+                unless an earlier message lacked the quantity. An absent key means it only after ``REGULAR_MESSAGES``.
         """
         is_loss = is_null and location not in self._irregular
         for key in keys:
@@ -335,7 +335,7 @@ class SampleAssembler:
         return ", ".join(first) + (f" and {others} other topics" if others else "")
 
 
-def _read(binding: _TopicBinding, payload: bytes, number: int | None) -> Mapping[int, float]:
+def _read_values(binding: _TopicBinding, payload: bytes, number: int | None) -> Mapping[int, float]:
     """Return the values of a payload by number of the cell or probe; 1 for a quantity with a single value.
 
     Args:

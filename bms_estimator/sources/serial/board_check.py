@@ -125,7 +125,7 @@ class BoardCheck:
         previous, self._known = self._known, {name: board.get(name, "") for name in STORED_FIELDS}
         if self._known != previous:
             is_recalibrated = self._log_new_board(previous)
-            # stored later, so that a restart finds a new calibration again unless its alarm is saved
+            # a new calibration is stored later: a restart before its alarm is saved must detect the change again
             self._store_attempt_s = now_s if is_recalibrated else -math.inf
         self._store_board(now_s)
 

@@ -101,7 +101,7 @@ class SerialPort:
         report: Called with the reason why the port is not open.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
-        first_retry_s: Delay before a missing or lost port is retried [s].
+        first_retry_s: First delay before a missing or lost port is retried [s].
 
     Attributes:
         openings: Number of times that the port was opened.

@@ -51,10 +51,10 @@ class SerialSource:
         settings: Port, protocol, baud rate, sample rate.
         board_file: File that stores the pack's board. It is used only if the board reports a serial number. None: the board is
             not stored.
-        tap: Receives a copy of each arrival time and chunk that the decoder is fed.
+        tap: Receives each chunk with its arrival time, before the chunk is decoded.
         wall: Wall clock [s since 1970].
         monotonic: Monotonic clock [s].
-        first_retry_s: Delay before a missing or lost port is retried [s].
+        first_retry_s: First delay before a missing or lost port is retried [s].
         silent_s: Time without a frame after which the line counts as silent [s].
     """
 
@@ -291,7 +291,7 @@ class SerialSource:
             raise
 
     async def _stay_open(self) -> None:
-        """Open the port, supervise it until it is lost, and repeat for ever."""
+        """Open the port, supervise it until it is lost, and repeat forever."""
         while True:
             if self._rejected:  # a user may have accepted another board since then
                 self.board_check.reload_known_board()

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from bms_estimator.settings.sources.modbus import MAX_WORDS, PROFILES, CellRegisters, ModbusSource, Register
 from bms_estimator.sources.fieldbus.modbus import (
-    GAP_WORDS,
+    MAX_GAP_WORDS,
     RegisterQuantity,
     decode,
     decode_reading,
@@ -71,7 +71,9 @@ def test_requests_cover_every_register_once_within_the_maximum_length(registers:
             assert request.address <= value.register.address
             assert value.register.address + value.register.words <= request.address + request.words
     for request, following in itertools.pairwise(requests):
-        is_near = following.table == request.table and following.address <= request.address + request.words + GAP_WORDS
+        is_near = (
+            following.table == request.table and following.address <= request.address + request.words + MAX_GAP_WORDS
+        )
         # Near requests remain separate only if a value of two words would exceed the maximum length.
         assert not is_near or following.address + 2 - request.address > MAX_WORDS - 1
 
@@ -80,7 +82,7 @@ def test_device_with_a_profile_is_read_in_as_few_requests_as_possible() -> None:
     (request,) = plan_requests(list_values(source(profile="victron-gx")))
     assert (request.table, request.address, request.words) == ("holding", 259, 8)
     assert (
-        request.described
+        request.description
         == "source.voltage, source.current, source.temperature, source.soc (holding registers 259 to 266)"
     )
     seplos = plan_requests(list_values(source(profile="seplos-v3")))

@@ -112,10 +112,11 @@ def parse_duration(cell: str) -> float:
 def parse_date_time(cell: str, *, day_first: bool = False) -> float:
     """Return the Unix time of a date and time [s]; UTC if the text has no time zone, midnight if it has no time.
 
-    Formats are ISO 8601, year first, day first with periods or with the English name of the month, and with slashes or hyphens as ``day_first`` says.
+    Formats are ISO 8601, year first, and day first with periods or with the English name of the month. With slashes or hyphens,
+    ``day_first`` selects the order of day and month.
 
     Raises:
-        ValueError: The text is not a date with time.
+        ValueError: The text is not a date.
     """
     cell = cell.strip()
     if named := _MONTH_NAME.match(cell):

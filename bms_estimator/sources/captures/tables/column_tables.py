@@ -58,8 +58,8 @@ class ArrayTable:
         header = list(table)
         layout = finder.find([str(column) for column in header])
         if layout is None:
-            raise finder.no_header()
-        self.layout = without_clock(layout)  # its kind of cells is not known
+            raise finder.no_header_error()
+        self.layout = without_clock(layout)  # the kind of the clock's cells is not known
         self._columns = {
             role: to_floats(name, column, table[header[column.index]]) for role, column in self.layout.columns.items()
         }
@@ -87,7 +87,7 @@ class ParquetTable:
         with _open_parquet(path) as file:
             layout = finder.find(file.schema_arrow.names)
             if layout is None:
-                raise finder.no_header()
+                raise finder.no_header_error()
             if file.metadata.num_rows == 0:
                 raise UserError(f"{path}: no samples")
             kinds = {role: _time_kind(file, layout.columns[role]) for role in TIME_ROLES if role in layout.columns}
@@ -209,5 +209,5 @@ def to_floats(name: object, column: Column, values: ArrayLike) -> NDArray[np.flo
         raise UserError(
             f"{name}: column {column.name} holds {array.dtype} of shape {array.shape}: must be numbers, one a row"
         )
-    with np.errstate(invalid="ignore"):  # a signaling NaN
+    with np.errstate(invalid="ignore"):  # a signaling NaN causes a warning
         return array.astype(np.float64)

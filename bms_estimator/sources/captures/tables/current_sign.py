@@ -18,13 +18,13 @@ SIGN_TEXTS: dict[CurrentSign, str] = {
 
 
 MAX_LOADS_WITHOUT_WORD = 0.05
-"""Maximum fraction of the rows with a load whose state has no word, for a direction by the states alone. Rows at the change of a
-step may have the state of the step before."""
+"""Maximum fraction of the rows with a load that have no word for charge or discharge. With more of them, the states alone do not
+give the direction. A row at the change of a step may have the state of the previous step."""
 
 
 MIN_OPPOSITE_ROWS, MIN_OPPOSITE_FRACTION = 3, 0.02
-"""Minimum number and fraction of the rows of a word whose current has the opposite sign, for a current that has a sign of its
-own, as in a drive cycle with regenerative braking."""
+"""Minimum number, and minimum fraction, of rows with the opposite sign among the rows with one word. With fewer, the current
+counts as unsigned. In a drive cycle with regenerative braking, the rows of a discharge have both signs."""
 
 
 class StateWords(NamedTuple):
@@ -63,7 +63,7 @@ def _has_both_signs(current: Floats) -> bool:
     return bool(opposite >= max(MIN_OPPOSITE_ROWS, MIN_OPPOSITE_FRACTION * current.size))
 
 
-class Sign(NamedTuple):
+class UserSign(NamedTuple):
     """Direction of positive current that the user configured."""
 
     option: CurrentSign | None = None
@@ -97,7 +97,7 @@ class CurrentDirection(NamedTuple):
 
 
 def find_direction(
-    name: object, layout: Layout, configured: Sign, response: VoltageResponse, words: StateWords
+    name: object, layout: Layout, configured: UserSign, response: VoltageResponse, words: StateWords
 ) -> CurrentDirection:
     """Return the direction of positive current in a table.
 
@@ -146,7 +146,7 @@ def _column_direction(layout: Layout, words: StateWords) -> CurrentDirection | N
 def _direct_by_voltage(
     name: object, layout: Layout, direction: CurrentDirection, response: VoltageResponse
 ) -> CurrentDirection:
-    """Return the direction of a current without a sign. In a table with this project's columns it stays, with a warning.
+    """Return the direction of a current without a sign. A table with this project's columns keeps its direction, with a warning.
 
     Raises:
         UserError: The voltage does not show the direction of each load.
@@ -163,7 +163,7 @@ def _direct_by_voltage(
     return CurrentDirection("discharge_positive", reason, row_factors=response.row_factors)
 
 
-def _defined_direction(layout: Layout, configured: Sign) -> CurrentDirection | None:
+def _defined_direction(layout: Layout, configured: UserSign) -> CurrentDirection | None:
     """Return the direction that the format or the settings define; None if neither does.
 
     A table with this project's columns may come from the pack itself; therefore the settings of its sensor decide first.

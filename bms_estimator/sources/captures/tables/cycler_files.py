@@ -33,8 +33,8 @@ def read_neware(path: Path, finder: LayoutFinder, suffix: str) -> ArrayTable:
     import fastnda  # noqa: PLC0415 - optional
 
     def read() -> ColumnTable:
-        with _with_suffix(path, suffix) as named:
-            return {column.name: column.to_numpy() for column in fastnda.read(named)}
+        with _with_suffix(path, suffix) as renamed:
+            return {column.name: column.to_numpy() for column in fastnda.read(renamed)}
 
     return ArrayTable(path, _call_library(path, read), finder, f"Neware {suffix}")
 

@@ -58,7 +58,7 @@ CLOCKS = (
     "date and time",
     "prog time",
 )
-"""Names of a second time column, which counts on over all steps of a test."""
+"""Names of a second time column, which does not restart at a step of the test."""
 
 OWN = Dialect(
     "bms_estimator",

@@ -19,7 +19,7 @@ from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTER
 from bms_estimator.sources.captures.tables.dialects import Dialect
 from bms_estimator.sources.captures.tables.history_records import CsvRecords, JsonRecords, Labels, Record
 from bms_estimator.sources.captures.tables.layout import Column, ColumnRole, Layout, RawBlock, Role
-from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder, shown, split_given_unit
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder, shorten_cells, split_given_unit
 from bms_estimator.sources.captures.tables.time_base import unix_unit
 from bms_estimator.sources.captures.tables.units import SI_UNITS, Quantity, Unit, find_unit
 
@@ -65,8 +65,8 @@ def assemble(voltage: TimedValues, current: TimedValues, temperature: TimedValue
     """Return a sample at each change of voltage or current, in the units of the values.
 
     A voltage and a current within ``SETTLE_S`` of each other belong to one sample. A sample with only a new current is marked as
-    having a held voltage. A sample with only a new voltage has the last current. It is marked as having a held current if the
-    current changes within a period, because the change may have been earlier than its record. An unchanged current is
+    having a held voltage. A sample with only a new voltage has the last current. If the next current is recorded within a period,
+    the sample is marked as having a held current, because the current may already have changed. An unchanged current is
     repeated, with a held voltage, until one period before its next change, so that its charge counts. There are no samples
     while voltage or current is unavailable, and no repeated ones in a pause longer than ``MAX_SILENT_S``.
     """
@@ -112,7 +112,7 @@ def _sample_times(voltage: TimedValues, current: TimedValues) -> Floats:
 
 
 def _repeat_times(voltage: TimedValues, current: TimedValues, changes_s: Floats, period_s: float) -> Floats:
-    """Return the times at which an unchanged current is repeated [s]."""
+    """Return the times at which an unchanged current is repeated [s]: at a fixed interval, and a period before it changes."""
     if changes_s.size == 0:
         return changes_s
     before_s, after_s = changes_s[:-1], changes_s[1:]
@@ -123,8 +123,8 @@ def _repeat_times(voltage: TimedValues, current: TimedValues, changes_s: Floats,
     interval_s = max(REPEAT_PERIODS * period_s, MIN_REPEAT_S)
     counts = np.where(holds, np.ceil((last_s - before_s) / interval_s).clip(min=1.0) - 1.0, 0.0).astype(np.int64)
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 1
-    confirmed = holds & ends & (last_s - before_s > 0.5 * period_s)
-    return np.concatenate([np.repeat(before_s, counts) + number * interval_s, last_s[confirmed]])
+    has_last = holds & ends & (last_s - before_s > 0.5 * period_s)
+    return np.concatenate([np.repeat(before_s, counts) + number * interval_s, last_s[has_last]])
 
 
 DIALECT = Dialect("history of entities", time=(), current=(), voltage=())
@@ -268,11 +268,11 @@ class HistoryExport:
         """Return the entity of a quantity: the one that the user named, or the only one that looks like it."""
         given = self._given.get(quantity)
         if given is None:
-            found, reason = self._similar(quantity), f"look like a {quantity}"
+            found, reason = self._find_similar(quantity), f"look like a {quantity}"
         else:
-            found, reason = self._named(given) or self._named(split_given_unit(given)[0]), f"have the name {given}"
+            found, reason = self._by_name(given) or self._by_name(split_given_unit(given)[0]), f"have the name {given}"
         if len(found) != 1:
-            raise self._unclear(f"{len(found) or 'no'} entities {reason}")
+            raise self._ambiguity_error(f"{len(found) or 'no'} entities {reason}")
         entity = found[0]
         if entity.invalid:
             raise UserError(
@@ -281,25 +281,25 @@ class HistoryExport:
             )
         return entity
 
-    def _named(self, name: str) -> Sequence[_Entity]:
+    def _by_name(self, name: str) -> Sequence[_Entity]:
         """Return the entities with a name, or with the name in one of their columns."""
         found = [entity for entity in self._entities if entity.name == name]
         return found or [entity for entity in self._entities if name in dict(entity.labels).values()]
 
-    def _unclear(self, reason: str) -> UserError:
+    def _ambiguity_error(self, reason: str) -> UserError:
         """Return the error of an ambiguous or missing entity. It lists the entities and shows the option that chooses one."""
         names = [entity.name for entity in self._entities]
-        examples = {"voltage": self._similar("voltage"), "current": self._similar("current")}
+        examples = {"voltage": self._find_similar("voltage"), "current": self._find_similar("current")}
         example = ",".join(
             f"{quantity}={similar[0].name if similar else f'NAME_OF_{quantity.upper()}'}"
             for quantity, similar in examples.items()
         )
         return UserError(
-            f"{self._path}: {reason}; entities with numbers: {shown(names) or 'none'}; name voltage and current as in "
+            f"{self._path}: {reason}; entities with numbers: {shorten_cells(names) or 'none'}; name voltage and current as in "
             f'--map "{example}" (in Python: column_map)'
         )
 
-    def _similar(self, quantity: Quantity) -> Sequence[_Entity]:
+    def _find_similar(self, quantity: Quantity) -> Sequence[_Entity]:
         """Return the entities that look like a quantity."""
         return [entity for entity in self._entities if entity.looks_like(quantity)]
 
@@ -310,7 +310,7 @@ class HistoryExport:
             UserError: The unit is not one of the quantity.
         """
         given = self._given.get(quantity, entity.name)
-        text = (None if self._named(given) else split_given_unit(given)[1]) or entity.unit
+        text = (None if self._by_name(given) else split_given_unit(given)[1]) or entity.unit
         unit = find_unit(quantity, text) if text else SI_UNITS[quantity]
         if unit is None:
             raise UserError(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder, shown
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder, shorten_cells
 from bms_estimator.sources.captures.tables.text_file import TextFile
 from bms_estimator.sources.captures.tables.text_format import (
     MAX_HEADER_CHARACTERS,
@@ -16,7 +16,7 @@ from bms_estimator.sources.captures.tables.text_format import (
     SEPARATORS,
     is_data,
     split_cells,
-    unquoted,
+    unquote,
 )
 from bms_estimator.sources.captures.tables.units import Quantity, find_unit
 
@@ -44,7 +44,7 @@ _FORMS = (
 _UNIT = "unit_of_measurement"
 _MEASUREMENTS = ("_measurement", "name")
 """Columns of InfluxDB with the name of the measurement. Home Assistant writes the unit as this name."""
-_MEASURED: tuple[Quantity, ...] = ("voltage", "current", "temperature")
+_SAMPLE_QUANTITIES: tuple[Quantity, ...] = ("voltage", "current", "temperature")
 _NO_LABELS = frozenset({"", "result", "table", "_start", "_stop", _UNIT})
 """Columns that do not name an entity."""
 _JSON_CHARACTERS = 256
@@ -73,7 +73,7 @@ class CsvRecords:
 
     Args:
         path: The file.
-        finder: Gives the column of the time, if the user named one.
+        finder: Contains the column of the time, if the user named one.
         form: Names of the columns.
         header: Cells of the header.
         first_line: Number of the line after the header, counted from 1.
@@ -96,7 +96,7 @@ class CsvRecords:
         self.description = f"text, separator {SEPARATORS[separator]}"
         self.times = _time_columns(finder, form)
         if set(self.times).isdisjoint(header):
-            raise UserError(f"{path}: no column {self.times[0]} for the time; found {shown(header)}")
+            raise UserError(f"{path}: no column {self.times[0]} for the time; found {shorten_cells(header)}")
 
     def __iter__(self) -> Iterator[Record]:
         """Yield the records. InfluxDB writes a header above each of its tables.
@@ -118,8 +118,8 @@ class CsvRecords:
                 if len(cells) < len(header):
                     self.warning = f"line {number}: {len(cells)} values, but the header has {len(header)} columns"
                 elif any(cells):
-                    named = dict(zip(header, cells, strict=False))
-                    yield _record(named, self._form, self.times, f"line {number}")
+                    cell_by_column = dict(zip(header, cells, strict=False))
+                    yield _record(cell_by_column, self._form, self.times, f"line {number}")
 
 
 class JsonRecords:
@@ -215,7 +215,7 @@ def open_records(path: Path, finder: LayoutFinder) -> CsvRecords | JsonRecords |
 
 
 def _split(line: str, separator: str) -> list[str]:
-    return [cell.strip() for cell in split_cells(unquoted(line), separator)]
+    return [cell.strip() for cell in split_cells(unquote(line), separator)]
 
 
 def _text(value: object) -> str:
@@ -240,10 +240,10 @@ def _time_columns(finder: LayoutFinder, form: _Form) -> tuple[str, ...]:
 
 def _record(cells: Mapping[str, str], form: _Form, times: Sequence[str], place: str) -> Record:
     """Return the record in the cells of a row."""
-    left_out = {form.value, *times, *_NO_LABELS}
-    names = [form.name] if form.name else [column for column, cell in cells.items() if cell and column not in left_out]
+    excluded = {form.value, *times, *_NO_LABELS}
+    names = [form.name] if form.name else [column for column, cell in cells.items() if cell and column not in excluded]
     measurements = (cells[column] for column in _MEASUREMENTS if column in cells)
-    units = (text for text in measurements if any(find_unit(quantity, text) for quantity in _MEASURED))
+    units = (text for text in measurements if any(find_unit(quantity, text) for quantity in _SAMPLE_QUANTITIES))
     return Record(
         labels=tuple((name, cells[name]) for name in names),
         unit=cells.get(_UNIT) or next(units, ""),

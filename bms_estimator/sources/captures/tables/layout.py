@@ -28,7 +28,7 @@ BLOCK_ROWS = 65_536
 """Maximum number of rows of a block."""
 
 ColumnMap = Mapping[Quantity | Literal["sheet", "instance"], str]
-"""Column names that the user gave, by quantity, the name of the sheet and the number of the battery."""
+"""Column names that the user gave, by quantity; also the name of the sheet and the number of the battery."""
 
 
 class Role(Enum):

@@ -108,7 +108,7 @@ class LayoutFinder:
             self._first_numbers = cells
         return None
 
-    def no_header(self) -> UserError:
+    def no_header_error(self) -> UserError:
         """Return the error for a table without a header. It names the columns of the line that is most similar to a header."""
         header, dialect, missing = self._closest
         if self.given and not header:
@@ -119,18 +119,18 @@ class LayoutFinder:
         ):  # a line of text may contain a name by chance
             if self._first_numbers and len(self._names) == len(self._first_numbers):
                 return UserError(
-                    f"{self._path}: the columns {shown(self._names)} have none of the known names: name them by {MAP_HELP}"
+                    f"{self._path}: the columns {shorten_cells(self._names)} have none of the known names: name them by {MAP_HELP}"
                 )
             if self._first_numbers:
                 return UserError(
-                    f"{self._path}: no line names the columns: add one above {shown(self._first_numbers)}, with a name for each "
+                    f"{self._path}: no line names the columns: add one above {shorten_cells(self._first_numbers)}, with a name for each "
                     f"of the {len(self._first_numbers)} columns, such as {','.join(OWN.signatures[0])}; columns that are not "
                     "needed may have any other names"
                 )
             return UserError(f"{self._path}: not a capture: no line names the columns; needed: {needed}")
         program = "" if dialect is GENERIC else f" in this export of {dialect.name}"
         return UserError(
-            f"{self._path}: no column of {' nor '.join(missing)}{program}; found {shown(header)}; needed: {needed}"
+            f"{self._path}: no column of {' nor '.join(missing)}{program}; found {shorten_cells(header)}; needed: {needed}"
         )
 
     def with_units(self, layout: Layout, units_row: Sequence[str]) -> Layout | None:
@@ -241,7 +241,7 @@ def split_given_unit(given: str) -> tuple[str, str | None]:
 def _own_columns(header: Sequence[str]) -> dict[ColumnRole, Column]:
     """Return the columns that only tables of this project have: cell voltages, extremes of the temperature probes and the status.
 
-    ``fleet capture`` writes exactly the columns of a sample and of the cells; the status of another table has another meaning.
+    The status is read only if the table has exactly the columns that ``fleet capture`` writes. Elsewhere it has another meaning.
     """
     cells = present_columns(header)
     columns: dict[ColumnRole, Column] = {
@@ -290,6 +290,6 @@ def _is_number(cell: str) -> bool:
         return False
 
 
-def shown(cells: Sequence[str]) -> str:
+def shorten_cells(cells: Sequence[str]) -> str:
     """Return cells of a line for messages, limited in number and length."""
     return ", ".join(cell[:MAX_SHOWN_CHARACTERS] for cell in cells[:MAX_SHOWN_COLUMNS])

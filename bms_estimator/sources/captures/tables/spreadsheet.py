@@ -88,7 +88,7 @@ class Spreadsheet:
             ]
         sheets = [sheet for sheet in found if sheet.name.lower().startswith(DATA_SHEETS)] or found
         if not sheets:
-            raise finder.no_header()
+            raise finder.no_header_error()
         if len({_CONTINUATION.sub("", sheet.name) for sheet in sheets}) > 1:
             several = ", ".join(sheet.name for sheet in sheets)
             raise UserError(

@@ -15,7 +15,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
-from bms_estimator.sources.captures.tables.current_sign import Sign, StateWords, find_direction, find_words
+from bms_estimator.sources.captures.tables.current_sign import StateWords, UserSign, find_direction, find_words
 from bms_estimator.sources.captures.tables.cycler_files import (
     MPR_MAGIC,
     NDA_MAGIC,
@@ -36,14 +36,14 @@ from bms_estimator.sources.captures.tables.table_samples import (
 )
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable
-from bms_estimator.sources.captures.tables.time_base import ClockTurns, find_time_base, is_descending
+from bms_estimator.sources.captures.tables.time_base import ClockUnwrapper, find_time_base, is_descending
 from bms_estimator.sources.captures.tables.voltage_response import VoltageResponse, voltage_response
 
 FIRST_ROWS = 262_144
 """Minimum number of rows at the beginning of a table that determine its time base and the sign of the current."""
 MAX_SHOWN_BATTERIES = 8
 """Maximum number of batteries in a message."""
-STEP_S = 1e-6
+STEP_SEPARATION_S = 1e-6
 """Time that is inserted between two rows with the same time and different currents [s]."""
 PARQUET_MAGIC, OLE_MAGIC = b"PAR1", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 """First bytes of Parquet files and of .xls files."""
@@ -89,7 +89,7 @@ class Table:
         note: Description of dialect, columns and sign; empty for a table with this project's columns.
     """
 
-    def __init__(self, name: object, reader: TableReader, configured: Sign, instance: float | None = None) -> None:
+    def __init__(self, name: object, reader: TableReader, configured: UserSign, instance: float | None = None) -> None:
         self._name, self._reader, self._instance = name, reader, instance
         self.implausible, self.cells = 0, NO_CELLS
         self._newest_first = False
@@ -134,10 +134,10 @@ class Table:
         self.implausible = 0
         before = np.empty(0, dtype=SAMPLE)
         start_s, rows = None, 0
-        turns = self._turns()
+        unwrapper = self._clock_unwrapper()
         for raw in self._rows():
             samples = to_samples(raw, self.layout)
-            samples["time_s"] = turns.apply(samples["time_s"])
+            samples["time_s"] = unwrapper.apply(samples["time_s"])
             if Role.CLOCK in self.layout.columns or self.layout.columns[Role.TIME].kind in DATES:
                 start_s = _first_finite(samples["time_s"]) if start_s is None else start_s
                 samples["time_s"] -= start_s
@@ -165,13 +165,13 @@ class Table:
 
     def _response(self, rows: RawBlock) -> VoltageResponse:
         samples = to_samples(rows, self.layout)
-        samples["time_s"] = self._turns().apply(samples["time_s"])
+        samples["time_s"] = self._clock_unwrapper().apply(samples["time_s"])
         return voltage_response(samples)
 
-    def _turns(self) -> ClockTurns:
+    def _clock_unwrapper(self) -> ClockUnwrapper:
         """Return a new correction of times that roll over or restart. Times of the day need none if a column has the dates."""
         time = self.layout.columns[Role.CLOCK if Role.CLOCK in self.layout.columns else Role.TIME]
-        return ClockTurns(time, is_step_time=self._is_step_time)
+        return ClockUnwrapper(time, is_step_time=self._is_step_time)
 
     def _rows(self) -> Iterator[RawBlock]:
         """Yield blocks with the rows of the battery, the oldest first."""
@@ -218,17 +218,17 @@ def _rows_of_battery(name: object, reader: TableReader, instance: float | None) 
             )
         if instance is None and len(found) > 1:
             raise UserError(
-                f"{name}: rows of several batteries, {column.name} = {_shown(found)}: choose one by "
+                f"{name}: rows of several batteries, {column.name} = {_join_numbers(found)}: choose one by "
                 f"--map instance={min(found):g} (in Python: column_map)"
             )
         chosen = np.ones(numbers.size, dtype=bool) if instance is None else numbers == instance
         if chosen.any():
             yield {role: values[chosen] for role, values in raw.items()}
     if instance is not None and instance not in found:
-        raise UserError(f"{name}: --map instance={instance:g}: no such battery; {column.name} = {_shown(found)}")
+        raise UserError(f"{name}: --map instance={instance:g}: no such battery; {column.name} = {_join_numbers(found)}")
 
 
-def _shown(numbers: set[float]) -> str:
+def _join_numbers(numbers: set[float]) -> str:
     """Return numbers of batteries for messages, limited in number."""
     return ", ".join(f"{number:g}" for number in sorted(numbers)[:MAX_SHOWN_BATTERIES]) or "empty"
 
@@ -244,7 +244,7 @@ def _cells_in_series(first: RawBlock) -> str:
 def _without_zero_temperature(layout: Layout, first: RawBlock) -> tuple[Layout, str]:
     """Return the layout without a temperature that is exactly 0 in each row, and a text that says so.
 
-    Programs write 0 if no probe is connected. Tables of this project have no such column then, and users name no such column.
+    Programs write 0 if no probe is connected. Tables of this project omit the column instead. A column that the user named is kept.
     """
     is_zero = Role.TEMPERATURE in first and not np.nan_to_num(first[Role.TEMPERATURE], nan=0.0).any()
     if not is_zero or layout.dialect is OWN or layout.has_given_columns:
@@ -255,7 +255,7 @@ def _without_zero_temperature(layout: Layout, first: RawBlock) -> tuple[Layout, 
 
 
 def _separate_steps(before: SampleBlock, samples: SampleBlock) -> SampleBlock:
-    """Separate rows that have the same time but different currents: add ``STEP_S`` to the time of the last such row.
+    """Separate rows that have the same time but different currents: add ``STEP_SEPARATION_S`` to the time of the last such row.
 
     Cyclers write the last row of a step and the first row of the next step at the same time. Both rows are needed, because
     each gives the current on its side of the step.
@@ -273,7 +273,7 @@ def _separate_steps(before: SampleBlock, samples: SampleBlock) -> SampleBlock:
     is_last = repeats & ~np.append(repeats[1:], False)
     first = np.maximum.accumulate(np.where(repeats, 0, np.arange(rows.size)))  # index of the first row with the time
     is_step = is_last & (current_a != current_a[first])
-    samples["time_s"][is_step[before.size :]] += STEP_S
+    samples["time_s"][is_step[before.size :]] += STEP_SEPARATION_S
     first_of_last_time: SampleBlock = rows[first[-1:]]
     return first_of_last_time
 
@@ -309,7 +309,7 @@ def _column_text(role: Role, column: Column) -> str:
     return f'{role.value} "{column.name}" in {column.unit.symbol}{" (assumed)" if column.assumed else ""}'
 
 
-def open_table(path: Path, configured: Sign, column_map: ColumnMap | None = None) -> Table:
+def open_table(path: Path, configured: UserSign, column_map: ColumnMap | None = None) -> Table:
     """Open a table; its format is recognized by the first bytes of the file, and for text by its columns.
 
     Raises:
@@ -325,7 +325,7 @@ def open_table(path: Path, configured: Sign, column_map: ColumnMap | None = None
 def _open_reader(path: Path, finder: LayoutFinder) -> TableReader:
     try:
         with path.open("rb") as file:
-            head = file.read(len(MPR_MAGIC))  # the longest
+            head = file.read(len(MPR_MAGIC))  # the longest magic number
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error.strerror}") from None
     if head.startswith(ZIP_MAGIC):
@@ -360,7 +360,7 @@ def _open_text(path: Path, finder: LayoutFinder) -> TableReader:
     return HistoryExport(path, finder, records) if records else TextTable(path, finder)
 
 
-def convert_table(table: ColumnTable, configured: Sign, column_map: ColumnMap | None = None) -> Table:
+def convert_table(table: ColumnTable, configured: UserSign, column_map: ColumnMap | None = None) -> Table:
     """Return the samples of a table in memory.
 
     Raises:

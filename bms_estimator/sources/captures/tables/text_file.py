@@ -18,7 +18,7 @@ GZIP_MAGIC, ZIP_MAGIC = b"\x1f\x8b", b"PK\x03\x04"
 SAMPLE_BYTES = 65_536
 """Number of bytes that show the encoding."""
 MAX_UTF_8_BYTES = 4
-"""Maximum length of a character in UTF-8, which the end of the sample may divide."""
+"""Maximum length of a character in UTF-8. The end of the sample may be within a character."""
 _HIGH_BYTES, _GB_2312 = re.compile(rb"[\x80-\xff]+"), re.compile(rb"(?:[\xa1-\xf7][\xa1-\xfe])+")
 _HANZI = re.compile(rb"(?:..)*?[\xb0-\xf7][\xa1-\xfe]", re.DOTALL)
 _LATIN_1_BYTES = "latin-1-bytes"
@@ -63,8 +63,8 @@ class TextFile:
         try:
             with self.path.open("rb") as self._raw:
                 self._size = self.path.stat().st_size
-                with self._decompressed(self._raw) as plain:
-                    yield _decoded(plain)
+                with self._decompress(self._raw) as plain:
+                    yield _decode(plain)
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             raise UserError(f"{self.path}: gzip data damaged or cut short: {error}") from None
         except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
@@ -75,7 +75,7 @@ class TextFile:
             raise UserError(f"{self.path}: cannot be read: {error.strerror or error}") from None
 
     @contextmanager
-    def _decompressed(self, raw: IO[bytes]) -> Iterator[IO[bytes]]:
+    def _decompress(self, raw: IO[bytes]) -> Iterator[IO[bytes]]:
         magic = raw.read(len(ZIP_MAGIC))
         raw.seek(0)
         if magic.startswith(GZIP_MAGIC):
@@ -99,8 +99,8 @@ class TextFile:
         return members[0]
 
 
-def _decoded(plain: IO[bytes]) -> TextIOWrapper:
-    """Return the text of a byte stream, by its byte order mark or by the zero bytes of UTF-16."""
+def _decode(plain: IO[bytes]) -> TextIOWrapper:
+    """Return a byte stream as text. The encoding is recognized by its byte order mark, zero bytes of UTF-16, or Chinese pairs."""
     sample = plain.read(SAMPLE_BYTES)
     plain.seek(0)
     head = sample[:2]

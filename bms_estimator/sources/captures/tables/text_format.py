@@ -20,8 +20,9 @@ PROBED_LINES = 200
 """Number of lines after the header that show units, decimal sign and format of the time."""
 _DEVICE = re.compile(r".+ \[\d+\]")
 """Name of a device in the line above the column names, by Victron VRM."""
-_NOT_SPACED = re.compile(r"[\t;|]|,(?!\d)|[:'](?:\s|$)")
-"""Other separators than spaces, and marks at the end of a word of a text. A comma before a digit is a decimal comma."""
+_NOT_SPACE_SEPARATED = re.compile(r"[\t;|]|,(?!\d)|[:'](?:\s|$)")
+"""Characters that show that spaces do not separate columns: other separators, and punctuation after a word. A comma before a
+digit is a decimal comma."""
 SEPARATORS = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "vertical bar", " ": "space"}
 """Separators of columns, in the order in which they are tried, with their names. Any number of spaces is one separator."""
 
@@ -56,8 +57,8 @@ def is_data(line: str) -> bool:
     return bool(line.strip()) and not line.startswith("#")
 
 
-def unquoted(line: str) -> str:
-    """Return a line that is in quotes as a whole without them, and another line as it is."""
+def unquote(line: str) -> str:
+    """Remove the quotes around a whole line. Return any other line unchanged."""
     text = line.strip()
     inner = text[1:-1].replace('""', "")
     is_quoted = len(text) > 1 and text[0] == text[-1] == '"' and '"' not in inner
@@ -67,7 +68,7 @@ def unquoted(line: str) -> str:
 def split_cells(line: str, separator: str) -> list[str]:
     """Return the cells of a line; an empty list if it is not valid CSV, or if spaces separate words of a text."""
     if separator == " ":
-        return [] if _NOT_SPACED.search(line) else line.split()
+        return [] if _NOT_SPACE_SEPARATED.search(line) else line.split()
     try:
         return next(csv.reader([line], delimiter=separator))
     except (csv.Error, StopIteration):
@@ -86,10 +87,10 @@ def find_format(text: TextIOWrapper, finder: LayoutFinder) -> TextFormat:
         if not line:
             break
         if "\0" in line:
-            raise finder.no_header()
+            raise finder.no_header_error()
         if not is_data(line):
             continue
-        names = unquoted(line)
+        names = unquote(line)
         for separator in SEPARATORS:
             header = _with_devices(split_cells(above, separator), split_cells(names, separator))
             layout = finder.find(header)
@@ -97,7 +98,7 @@ def find_format(text: TextIOWrapper, finder: LayoutFinder) -> TextFormat:
                 text_format = TextFormat(layout, names, len(header), number + 1, separator, is_quoted=names != line)
                 return _probe(text_format, text, finder, header)
         above = names
-    raise finder.no_header()
+    raise finder.no_header_error()
 
 
 def _with_devices(devices: Sequence[str], header: Sequence[str]) -> Sequence[str]:
@@ -115,7 +116,7 @@ def _probe(text_format: TextFormat, text: TextIOWrapper, finder: LayoutFinder, h
 
     The order of day and month follows from the dates of all lines.
     """
-    unquoted_text = map(unquoted, text) if text_format.is_quoted else text
+    unquoted_text = map(unquote, text) if text_format.is_quoted else text
     lines = list(itertools.islice(unquoted_text, PROBED_LINES))
     rows = [split_cells(line, text_format.separator) for line in lines if is_data(line)]
     first_line, layout = text_format.first_line, text_format.layout
@@ -124,9 +125,8 @@ def _probe(text_format: TextFormat, text: TextIOWrapper, finder: LayoutFinder, h
         first_line += 1 + next(index for index, line in enumerate(lines) if is_data(line))
         rows = rows[1:]
     upper_layers = next(index for index, cell in enumerate(header) if cell.strip())
-    if not any(
-        row and not any(row[:upper_layers]) for row in rows
-    ):  # the column without a name is the index of the rows
+    # a column without a name that is never empty is the index of the rows
+    if not any(row and not any(row[:upper_layers]) for row in rows):
         upper_layers = 0
     rows = [row for row in rows if not any(row[:upper_layers])]
     complete = [row for row in rows if len(row) > max(column.index for column in layout.columns.values())]

@@ -27,7 +27,7 @@ from bms_estimator.sources.captures.tables.text_format import (
     find_format,
     is_data,
     split_cells,
-    unquoted,
+    unquote,
 )
 
 _WITH_UNIT = re.compile(r"[-+\d.,]+\s*[^\W\d]{1,3}")
@@ -62,8 +62,8 @@ class TextTable:
     def blocks(self) -> Iterator[RawBlock]:
         """Yield blocks of at most ``BLOCK_ROWS`` rows.
 
-        Repeated headers with the lines without a number above them, and such lines after the last row, are ignored, and a last
-        row that is cut off.
+        These lines are ignored: a repeated header with the preamble above it, lines without numbers after the last row, and a
+        last row that is cut off.
 
         Raises:
             UserError: A row is not valid; the message names file, line and column.
@@ -74,8 +74,8 @@ class TextTable:
                 pass
             row_parser = _RowParser(self._path, self._format, self.layout)
             count = 0
-            rest = map(unquoted, text) if self._format.is_quoted else text
-            while lines := list(itertools.islice(rest, BLOCK_ROWS)):
+            data_lines = map(unquote, text) if self._format.is_quoted else text
+            while lines := list(itertools.islice(data_lines, BLOCK_ROWS)):
                 values = self._fast_values(lines)
                 if values is None:
                     values = row_parser.parse(lines, line)
@@ -131,8 +131,8 @@ class _RowParser:
     """Parser of rows cell by cell, which names line and column of an error.
 
     Attributes:
-        pending_error: Error of the first line that is not a row after the last row, if rows follow; None without one.
-        cut_line: Description of a row that is cut off, if it is the last; empty without one.
+        pending_error: Error of the first line since the last row that is not a row. It is raised only if a row follows.
+        cut_line: Description of a last row that is cut off; empty without one.
     """
 
     def __init__(self, path: Path, text_format: TextFormat, layout: Layout) -> None:

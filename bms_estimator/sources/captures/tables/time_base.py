@@ -13,15 +13,17 @@ from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit, find_u
 FIRST_UNIX_S, LAST_UNIX_S = 9e8, 4e9
 """Range of Unix times in a capture: 1998 to 2096 [s]."""
 MIN_BETTER_FRACTION = 0.1
-"""Minimum difference of the fractions of samples that are not later than all before, for a preference of the second column."""
+"""Minimum advantage of the second time column for its choice. Each column is judged by the fraction of its times that are not
+later than all earlier ones."""
 MAX_RATE_ERROR = 0.2
 """Maximum relative difference of the rates of two time columns that agree."""
 DAY_S = 86_400.0
 CHUNKS = 8
 """Number of parts of a table in which two time columns are compared. Their median excludes pauses of one of them."""
-TURNS_S = {CellKind.DURATION: (DAY_S, 1800.0)} | dict.fromkeys(DATES, (3600.0, 600.0))
-"""Step back of a clock at midnight and at the end of summer time, by the kind of its cells, and the maximum step of the time
-across it [s]. With a longer one, the clock was set or the test was restarted."""
+ROLLOVERS_S = {CellKind.DURATION: (DAY_S, 1800.0)} | dict.fromkeys(DATES, (3600.0, 600.0))
+"""Backward step of a clock at a rollover, by the kind of its cells: times of the day at midnight, dates at the end of summer time
+[s]. The second number is the maximum true time between the rows around it [s]; after a longer one, the clock was set or the
+test was restarted."""
 MIN_STEP_RESTARTS, MIN_STEP_FRACTION, MIN_STEP_CHANGE = 2, 0.8, 0.05
 """For a time that starts again with each step: minimum number of its restarts, minimum fraction of them at which the current
 changes, and minimum change relative to the range of the current."""
@@ -78,7 +80,7 @@ def find_time_base(layout: Layout, raw: RawBlock) -> TimeBase:
 
 
 def _is_step_time(values: Floats, current: Floats) -> bool:
-    """Return True if a time starts again, near 0, where the current changes. After a restart of the tester, it does not change."""
+    """Return True if a time restarts near 0 where the current changes. At a restart of the tester, the current does not change."""
     valid = np.isfinite(values) & np.isfinite(current)
     times, steps, changes = values[valid], np.diff(values[valid]), np.abs(np.diff(current[valid]))
     is_restart = steps < 0.0
@@ -89,7 +91,7 @@ def _is_step_time(values: Floats, current: Floats) -> bool:
     return bool(near_0.all() and np.mean(is_change) >= MIN_STEP_FRACTION)
 
 
-class ClockTurns:
+class ClockUnwrapper:
     """Continuation of times of the day across midnight, of dates across the end of summer time, and of the times of steps.
 
     Args:
@@ -98,27 +100,29 @@ class ClockTurns:
     """
 
     def __init__(self, time: Column, *, is_step_time: bool) -> None:
-        self._turn_s, self._max_step_s = TURNS_S.get(time.kind, (0.0, 0.0))
+        self._rollover_s, self._max_step_s = ROLLOVERS_S.get(time.kind, (0.0, 0.0))
         self._is_step_time = is_step_time
         self._last_s, self._added_s = np.nan, 0.0
 
     def apply(self, time_s: Floats) -> Floats:
-        """Return the times of the next rows [s], each without the turns of the clock before it."""
+        """Return the times of the next rows, without the backward steps of the clock [s]."""
         finite = np.flatnonzero(np.isfinite(time_s))
-        if not (self._turn_s or self._is_step_time) or not finite.size:
+        if not (self._rollover_s or self._is_step_time) or not finite.size:
             return time_s
         values_s = time_s[finite]
         steps_s = np.diff(values_s, prepend=self._last_s)
         before_s = values_s - steps_s
         if self._is_step_time:
-            turns_s = np.where(steps_s < 0.0, before_s, 0.0)
+            rollovers_s = np.where(steps_s < 0.0, before_s, 0.0)
         else:
-            before_day_end = (before_s < DAY_S) | (self._turn_s < DAY_S)
-            is_turn = (-self._turn_s < steps_s) & (steps_s <= self._max_step_s - self._turn_s) & before_day_end
-            turns_s = self._turn_s * is_turn
+            can_roll_over = (before_s < DAY_S) | (self._rollover_s < DAY_S)
+            is_rollover = (
+                (-self._rollover_s < steps_s) & (steps_s <= self._max_step_s - self._rollover_s) & can_roll_over
+            )
+            rollovers_s = self._rollover_s * is_rollover
         self._last_s = float(values_s[-1])
         added_s = self._added_s + np.zeros(time_s.size)
-        added_s[finite] += np.cumsum(turns_s)
+        added_s[finite] += np.cumsum(rollovers_s)
         self._added_s = float(added_s[finite[-1]])
         return time_s + added_s
 
@@ -163,8 +167,8 @@ def _by_clock(layout: Layout, time: Column, clock: Column, raw: RawBlock) -> Tim
     rate = _rate(raw[Role.CLOCK] * clock.unit.factor, raw[Role.TIME])
     if rate is None:
         return None
-    late, clock_late = (_late_fraction(raw[role], raw[Role.CURRENT]) for role in (Role.TIME, Role.CLOCK))
-    if clock_late < late - MIN_BETTER_FRACTION:
+    disorder, clock_disorder = (_disorder_fraction(raw[role], raw[Role.CURRENT]) for role in (Role.TIME, Role.CLOCK))
+    if clock_disorder < disorder - MIN_BETTER_FRACTION:
         with_clock = _with_time(layout, dataclasses.replace(clock, is_lenient=False))
         return TimeBase(with_clock, Role.CLOCK, f'"{time.name}" repeats times, or goes back')
     units = TIME_UNITS if time.assumed else (time.unit,)
@@ -220,7 +224,7 @@ def _rate(clock_s: Floats, values: Floats) -> float | None:
     return rate if 0.0 < rate < np.inf else None
 
 
-def _late_fraction(values: Floats, current: Floats) -> float:
+def _disorder_fraction(values: Floats, current: Floats) -> float:
     """Return the fraction of times that are not larger than all before. Cyclers repeat a time where the current changes."""
     valid = np.isfinite(values)
     times, latest, changes = (

@@ -14,8 +14,8 @@ HELD = int(SampleStatus.VOLTAGE_HELD | SampleStatus.CURRENT_HELD)
 LOAD_FRACTION = 0.01
 """Minimum current of a load, as a fraction of the largest current."""
 STEP_FRACTION = 0.1
-"""Minimum change of the current that counts as a step, as a fraction of its range; in a stretch of constant current, of the
-current itself."""
+"""Minimum change of the current that counts as a step, as a fraction of the current's range. In a stretch of constant current it
+is a fraction of the current itself."""
 MIN_STEPS = 2
 """Minimum number of steps for a decision. A single step may be a glitch."""
 MIN_STEPS_OF_LOAD = 5
@@ -29,17 +29,17 @@ MIN_CORRELATION = 0.7
 MIN_TREND_ROWS = 20
 """Minimum number of samples for a decision by a trend of the voltage."""
 NOISE_RATIO = 4.0
-"""Minimum change of the voltage in a trend, in std of its noise. The stretches end at the extremes of the voltage."""
+"""Minimum change of the voltage in a trend, in std of its noise. Stretches end at extremes of the voltage, which include noise."""
 MIN_OTHER_FRACTION = 0.1
-"""Minimum fraction of the charge in the other direction, for which a current of one sign is a current without a sign, and for
-which charge and discharge follow each other without a rest in a load."""
-MIN_TURN = 0.03
+"""Minimum fraction of the charge that, by the voltage, flows in the other direction. In a table with currents of one sign it shows
+that the sign is missing. In one load it shows that charge and discharge follow each other without a rest."""
+MIN_REVERSAL = 0.03
 """Minimum change of the voltage against the direction of a load, in a stretch of constant current, relative to the voltage.
 Recovery after a larger current, and warming of a cold cell, change it less."""
 MIN_CHANGE = 1e-3
 """Minimum change of the voltage that shows the direction of a load, relative to the voltage."""
 LARGE_STRETCH_FRACTION = 0.02
-"""Minimum fraction of the charge of a stretch that is divided where its voltage turns."""
+"""Minimum fraction of the charge of a stretch that is divided at the extremes of its voltage."""
 
 
 class VoltageResponse(NamedTuple):
@@ -47,8 +47,8 @@ class VoltageResponse(NamedTuple):
 
     Attributes:
         sign: Direction of positive current; None if the voltage shows none, or if the current has no sign.
-        row_factors: Of a current without a sign: factors of the samples, 1 on discharge and -1 on charge; None if the current has
-            a sign, or if the direction of a load is not known.
+        row_factors: Factors of the samples, 1 on discharge and -1 on charge, for a current without a sign. None if the current
+            has a sign, or if the direction of a load is not known.
         has_no_sign: True if the current has one sign, but the voltage shows both charge and discharge.
     """
 
@@ -86,8 +86,8 @@ def voltage_response(samples: SampleBlock) -> VoltageResponse:
         if has_one_sign and (unsigned := _without_sign(rows, stretches)):
             if unsigned.row_factors is None:
                 return unsigned
-            used = np.maximum(np.cumsum(valid) - 1, 0)  # a sample that is not used belongs to the load before it
-            return unsigned._replace(row_factors=unsigned.row_factors[used])
+            row_index = np.maximum(np.cumsum(valid) - 1, 0)  # a sample that is not used belongs to the load before it
+            return unsigned._replace(row_factors=unsigned.row_factors[row_index])
         response = (
             _trend_response(rows, stretches)
             or _step_response(rows["current_a"], rows["voltage_v"])
@@ -117,15 +117,15 @@ def _is_load(rows: SampleBlock) -> NDArray[np.bool_]:
 
 
 def _constant_stretches(rows: SampleBlock) -> _Parts:
-    """Return the stretches of constant current. A stretch with much charge is divided where its voltage turns."""
+    """Return the stretches of constant current. A stretch with much charge is divided at the extremes of its voltage."""
     magnitude_a = np.abs(rows["current_a"])
     begins = np.abs(np.diff(rows["current_a"], prepend=rows["current_a"][:1])) > 0.5 * STEP_FRACTION * magnitude_a
     loaded = _is_load(rows)
     parts = _parts(rows, begins, loaded)
     for index in np.flatnonzero(parts.charge > LARGE_STRETCH_FRACTION * parts.charge.sum()):
         voltage_v = rows["voltage_v"][parts.first[index] : parts.last[index] + 1]
-        for turn in (int(np.argmin(voltage_v)), int(np.argmax(voltage_v))):
-            begins[parts.first[index] + turn] = True
+        for extreme in (int(np.argmin(voltage_v)), int(np.argmax(voltage_v))):
+            begins[parts.first[index] + extreme] = True
     parts = _parts(rows, begins, loaded)
     drift_a = np.abs(magnitude_a[parts.last] - magnitude_a[parts.first])
     is_constant = drift_a <= STEP_FRACTION * magnitude_a[parts.first]
@@ -136,12 +136,14 @@ def _without_sign(rows: SampleBlock, stretches: _Parts) -> VoltageResponse | Non
     """Return the directions of the loads of a current with one sign; None if all have the same direction."""
     loads = _parts(rows, np.zeros(rows.size, dtype=np.bool_), _is_load(rows))
     direction = _direction_by_steps(rows, loads)
-    by_ends, turns = _direction_by_ends(rows, loads, stretches)
-    turns &= direction == 0.0
+    by_ends, has_reversal = _direction_by_ends(rows, loads, stretches)
+    has_reversal &= direction == 0.0
     direction = np.where(direction == 0.0, by_ends, direction)
     total = loads.charge.sum()
-    discharge, charge, turning = (loads.charge[mask].sum() for mask in (direction > 0.0, direction < 0.0, turns))
-    if turning <= MIN_OTHER_FRACTION * total and min(discharge, charge) <= MIN_OTHER_FRACTION * total:
+    discharge, charge, reversing = (
+        loads.charge[mask].sum() for mask in (direction > 0.0, direction < 0.0, has_reversal)
+    )
+    if reversing <= MIN_OTHER_FRACTION * total and min(discharge, charge) <= MIN_OTHER_FRACTION * total:
         return None
     if discharge + charge < (1.0 - MIN_OTHER_FRACTION) * total:
         return VoltageResponse(has_no_sign=True)
@@ -177,10 +179,12 @@ def _direction_by_ends(rows: SampleBlock, loads: _Parts, stretches: _Parts) -> t
     is_clear = np.abs(total_v) >= np.maximum(0.5 * np.abs(changes_v).sum(axis=0), MIN_CHANGE * middle_v)
     direction = np.where(is_clear, -np.sign(total_v), 0.0)
     load = np.searchsorted(loads.first, stretches.first, side="right") - 1
-    is_opposite = (np.sign(stretches.change_v) == direction[load]) & (np.abs(stretches.change_v) > MIN_TURN * middle_v)
+    is_opposite = (np.sign(stretches.change_v) == direction[load]) & (
+        np.abs(stretches.change_v) > MIN_REVERSAL * middle_v
+    )
     opposite = np.bincount(load, stretches.charge * is_opposite, loads.first.size)
-    turns = opposite > MIN_OTHER_FRACTION * loads.charge
-    return np.where(turns, 0.0, direction), turns
+    has_reversal = opposite > MIN_OTHER_FRACTION * loads.charge
+    return np.where(has_reversal, 0.0, direction), has_reversal
 
 
 def _trend_response(rows: SampleBlock, stretches: _Parts) -> int:
