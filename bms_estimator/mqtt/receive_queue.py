@@ -6,10 +6,9 @@ from collections.abc import Callable
 import aiomqtt
 
 MAX_WAITING = 100
-"""Maximum number of messages that wait to be read; further messages are lost."""
+"""Default of ``ConnectOptions.max_waiting``."""
 MAX_BYTES = 16_384
-"""Maximum length of a received message [bytes]. An MQTT 5 broker enforces it; longer messages of an older broker are
-discarded on arrival."""
+"""Default of ``ConnectOptions.max_bytes`` [bytes]."""
 
 
 class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):

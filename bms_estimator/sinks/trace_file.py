@@ -51,11 +51,9 @@ class CsvSink:
         self._file: IO[bytes] | None = None
 
     def __enter__(self) -> Self:
-        """Return the sink; the first block opens the file."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Complete the file."""
         self._files.close()
 
     def write(self, trace: NDArray[np.void]) -> None:
@@ -89,11 +87,9 @@ class ParquetSink:
         self._writer: Any = None
 
     def __enter__(self) -> Self:
-        """Return the sink; the first block opens the file."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Complete the file."""
         self._files.close()
 
     def write(self, trace: NDArray[np.void]) -> None:

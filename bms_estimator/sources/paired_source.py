@@ -77,7 +77,6 @@ class PairedSource:
         return self._monitor.clock_fault
 
     async def __aenter__(self) -> Self:
-        """Open both devices."""
         async with contextlib.AsyncExitStack() as stack:
             await stack.enter_async_context(self._monitor)
             await stack.enter_async_context(self._bms)
@@ -86,7 +85,6 @@ class PairedSource:
         return self
 
     async def __aexit__(self, *error: object) -> None:
-        """Close both devices."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait({self._task})

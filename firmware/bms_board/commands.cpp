@@ -35,8 +35,7 @@ static void answer_ack(uint8_t command, uint8_t result, uint32_t value) {
     ack_length = encode_ack(ack, &message);
 }
 
-// Builds the hello when the line has room and not when it is requested, because samples may be sent meanwhile, and its
-// sequence must not be older than theirs.
+// Builds the hello only when the line has room: its sequence must not be older than that of a sample sent meanwhile.
 static bool send_hello() {
     hello_message hello = {};
     hello.firmware_major = FIRMWARE_MAJOR;

@@ -42,8 +42,8 @@ enum sample_status {
 #define CHANNEL_NTC 0x01
 #define CHANNEL_CURRENT_RATIOMETRIC 0x02
 
-// The value of COMMAND_SET_RELAY: bit 0 is the level, the second byte the level when the host is silent, and the upper
-// half the duration of the silence in seconds.
+// The value of COMMAND_SET_RELAY: bit 0 is the level, the second byte the level after a silence of the host, and the
+// upper half its duration in seconds.
 enum relay_silence { RELAY_KEEP = 0, RELAY_LOW = 1, RELAY_HIGH = 2 };
 #define RELAY_SILENT_MAX_S 3600
 

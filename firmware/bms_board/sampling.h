@@ -23,8 +23,8 @@ const window_timing &sampling_timing();
 sample_message *sampling_window();
 void sampling_release();
 
-// Sleeps until the next interrupt while a conversion runs, because a halted CPU makes less noise. It does not sleep
-// between two conversions, because halting the CPU would start a conversion.
+// Sleeps until the next interrupt while a conversion runs, because a halted CPU makes less noise. Between two
+// conversions, halting the CPU would start one.
 void sampling_sleep();
 
 #endif

@@ -1,4 +1,4 @@
-// Simulator of a board that runs the firmware's ELF file, with readings at its sensors and a pseudo-terminal as its line.
+// Simulator that runs the firmware's ELF file, with readings at its sensors and a pseudo-terminal as its line.
 
 #include <getopt.h>
 #include <math.h>
@@ -97,7 +97,7 @@ static void turn(double board_s) {
     pace(board_s);
 }
 
-// Runs the board. Cycles are counted here, because a reset of the board would clear simavr's own timers.
+// Runs the board, and counts cycles itself: a reset of the board would clear simavr's timers.
 static int run(avr_t *avr, const options *o) {
     avr_cycle_count_t next_turn = 0, next_byte = NEVER;
     while (!stop && !(o->stop_at_end && readings_ended())) {

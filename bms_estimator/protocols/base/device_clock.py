@@ -21,8 +21,8 @@ MAX_SPACING_RATIO = 2.5
 RECOVERY_STEPS = 3
 """Number of successive windows without drift and large jumps after which a clock is usable again."""
 MAX_JUMP_RATE = 0.8
-"""Maximum sum of the jumps in a window, relative to its duration. Three successive windows above it show a wrong clock. A clock
-that is set once jumps in one window. Samples at 1 Hz that overtake each other by up to 3 s reach 0.7 in one of three windows."""
+"""Maximum sum of the jumps in a window, relative to its duration. Three successive windows above it show a wrong clock. Setting a
+clock changes one window. Samples at 1 Hz that overtake each other by up to 3 s reach 0.7 in one of three windows."""
 _JUMPS_TEXT = (
     "the times of the source jump again and again, and the arrival times are used instead; let only one device send, "
     "correct its clock, or do not send its times"

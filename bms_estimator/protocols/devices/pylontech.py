@@ -48,7 +48,7 @@ MAX_DIGITS = 9
 SOC = "Coulomb"
 """Column of the SOC [%]."""
 TIME = "Time"
-"""Column whose cells have a date and a time. Splitting a row at its spaces makes two cells of them."""
+"""Column with a date and a time, which a split at spaces separates."""
 MAX_MISSING_S = 3600.0
 """Time after which a battery that was present before counts as removed [s]."""
 ABSENT = "-"

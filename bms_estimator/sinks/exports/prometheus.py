@@ -148,12 +148,10 @@ class PrometheusSink:
         self._last = snapshot._replace(estimate=estimate)
 
     async def __aenter__(self) -> Self:
-        """Start listening."""
         await self._server.__aenter__()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Stop listening and close all connections."""
         await self._server.__aexit__()
 
     async def _collect(self) -> Iterable[Metric]:

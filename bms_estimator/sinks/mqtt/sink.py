@@ -311,14 +311,7 @@ class MqttSink:
 
 
 class OutboxSender(QueueSender):
-    """Fills an outbox and sends its messages.
-
-    Args:
-        outbox: Queue to fill and to empty.
-        delivery: Statistics, as in ``QueueSender``.
-        denied: Denied topics, as in ``QueueSender``.
-        first_delay_s: Delay after a temporary rejection, as in ``QueueSender`` [s].
-    """
+    """Fills an outbox and sends its messages. The parameters are those of ``QueueSender``."""
 
     def __init__(self, outbox: Outbox, delivery: DeliveryStats, denied: DeniedTopics, first_delay_s: float) -> None:
         super().__init__(outbox, delivery, denied, first_delay_s)

@@ -198,9 +198,7 @@ class TerminalSink:
     """Sink that shows snapshots as a subscriber would see them. ``publish`` does not wait for a blocked stdout.
 
     Args:
-        log: Log lines, the last of which are shown.
-        hint: Last line of the screen.
-        true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
+        log, hint, true_soc: As in ``LiveView``.
         clock: Wall clock and monotonic clock.
     """
 
@@ -220,12 +218,10 @@ class TerminalSink:
         self._sent = PublishedState()
 
     async def __aenter__(self) -> Self:
-        """Start the view."""
         await self._view.__aenter__()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Close the view."""
         await self._view.__aexit__(None, None, None)
 
     def publish(self, snapshot: Snapshot) -> None:

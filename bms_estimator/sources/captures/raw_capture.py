@@ -45,7 +45,6 @@ from bms_estimator.sources.captures.tables.text_file import GZIP_MAGIC
 MAGIC = b"BMSRAW1\n"
 """First bytes of a raw capture."""
 VERSION = 1
-"""Version of the file format."""
 MAX_READ_BYTES = 1 << 20
 """Maximum length of the bytes in a record."""
 CHUNK_BYTES = 1 << 20
@@ -198,11 +197,9 @@ class CaptureWriter:
                 self._descriptor = -1
 
     def __enter__(self) -> Self:
-        """Return the writer."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file."""
         self.close()
 
     def _append(self, data: bytes) -> None:

@@ -87,7 +87,6 @@ class CaptureRecorder:
             await asyncio.wrap_future(self.ended)
 
     def __enter__(self) -> Self:
-        """Return the recorder."""
         return self
 
     def __exit__(self, *_: object) -> None:

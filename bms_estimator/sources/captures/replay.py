@@ -192,7 +192,6 @@ class Replay:
         return self._decoder.clock_fault if self._decoder else ""
 
     async def __aenter__(self) -> Self:
-        """Return the replay; the file is opened by the iteration."""
         return self
 
     async def __aexit__(self, *_: object) -> None:

@@ -15,8 +15,7 @@ MAX_SHOWN_CHARACTERS = 40
 MAX_CELL_NUMBER = 400
 """Highest cell number in a path or topic."""
 MAX_INDEX_DIGITS = 9
-"""Number of digits of a list index that are converted for a comparison with the length of the list. ``int`` rejects a text of
-thousands of digits. No list is long enough for an index with more digits."""
+"""Number of digits of a list index that are converted, because ``int`` rejects very long texts. No list has a longer index."""
 NO_VALUE = frozenset(("", "null", "none", "nan", "unavailable", "unknown"))
 """Texts with which publishers report a sensor without a value, in lower case."""
 CELL_PLACEHOLDER = re.compile(r"\{cell\}")

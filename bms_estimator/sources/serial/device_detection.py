@@ -149,11 +149,9 @@ class BoardClient:
         self._board, self._text = BoardProtocol(), TextProtocol()
 
     def __enter__(self) -> Self:
-        """Return the board client."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the port."""
         self._line.close()
 
     def hello(self) -> Hello:

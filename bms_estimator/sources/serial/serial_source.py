@@ -145,7 +145,6 @@ class SerialSource:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        """Close the port."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)

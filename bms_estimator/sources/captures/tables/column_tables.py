@@ -209,5 +209,5 @@ def to_floats(name: object, column: Column, values: ArrayLike) -> NDArray[np.flo
         raise UserError(
             f"{name}: column {column.name} holds {array.dtype} of shape {array.shape}: must be numbers, one a row"
         )
-    with np.errstate(invalid="ignore"):  # a signaling NaN causes a warning
+    with np.errstate(invalid="ignore"):  # for signaling NaN
         return array.astype(np.float64)

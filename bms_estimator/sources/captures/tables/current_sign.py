@@ -18,13 +18,13 @@ SIGN_TEXTS: dict[CurrentSign, str] = {
 
 
 MAX_LOADS_WITHOUT_WORD = 0.05
-"""Maximum fraction of the rows with a load that have no word for charge or discharge. With more of them, the states alone do not
-give the direction. A row at the change of a step may have the state of the previous step."""
+"""Maximum fraction of the rows with a load that have no word, for a direction by the states alone. A row at the change of a step
+may have the state of the previous step."""
 
 
 MIN_OPPOSITE_ROWS, MIN_OPPOSITE_FRACTION = 3, 0.02
-"""Minimum number, and minimum fraction, of rows with the opposite sign among the rows with one word. With fewer, the current
-counts as unsigned. In a drive cycle with regenerative braking, the rows of a discharge have both signs."""
+"""Minimum number, and fraction, of the rows of one word whose current has the opposite sign. With fewer, the current counts as
+unsigned. In a drive cycle with regenerative braking, a discharge has both signs."""
 
 
 class StateWords(NamedTuple):

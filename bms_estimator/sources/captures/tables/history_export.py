@@ -143,9 +143,6 @@ _WORD = re.compile(r"[^\W\d_]+")
 class _Entity:
     """Values of one entity.
 
-    Args:
-        labels: Names and cells of the columns that identify it.
-
     Attributes:
         labels: Names and cells of the columns that identify it.
         unit: Unit as text; empty if the file states none.

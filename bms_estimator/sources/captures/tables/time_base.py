@@ -13,17 +13,15 @@ from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit, find_u
 FIRST_UNIX_S, LAST_UNIX_S = 9e8, 4e9
 """Range of Unix times in a capture: 1998 to 2096 [s]."""
 MIN_BETTER_FRACTION = 0.1
-"""Minimum advantage of the second time column for its choice. Each column is judged by the fraction of its times that are not
-later than all earlier ones."""
+"""Minimum advantage of the second time column for its choice, in the fraction of times that are not later than all before."""
 MAX_RATE_ERROR = 0.2
 """Maximum relative difference of the rates of two time columns that agree."""
 DAY_S = 86_400.0
 CHUNKS = 8
 """Number of parts of a table in which two time columns are compared. Their median excludes pauses of one of them."""
 ROLLOVERS_S = {CellKind.DURATION: (DAY_S, 1800.0)} | dict.fromkeys(DATES, (3600.0, 600.0))
-"""Backward step of a clock at a rollover, by the kind of its cells: times of the day at midnight, dates at the end of summer time
-[s]. The second number is the maximum true time between the rows around it [s]; after a longer one, the clock was set or the
-test was restarted."""
+"""Backward step of times of the day at midnight, and of dates at the end of summer time, by the kind of the cells; and the
+maximum true time between the rows around it [s]. If it is longer, the clock was set or the test was restarted."""
 MIN_STEP_RESTARTS, MIN_STEP_FRACTION, MIN_STEP_CHANGE = 2, 0.8, 0.05
 """For a time that starts again with each step: minimum number of its restarts, minimum fraction of them at which the current
 changes, and minimum change relative to the range of the current."""

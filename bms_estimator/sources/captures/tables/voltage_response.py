@@ -31,8 +31,8 @@ MIN_TREND_ROWS = 20
 NOISE_RATIO = 4.0
 """Minimum change of the voltage in a trend, in std of its noise. Stretches end at extremes of the voltage, which include noise."""
 MIN_OTHER_FRACTION = 0.1
-"""Minimum fraction of the charge that, by the voltage, flows in the other direction. In a table with currents of one sign it shows
-that the sign is missing. In one load it shows that charge and discharge follow each other without a rest."""
+"""Minimum fraction of the charge that, by the voltage, flows in the other direction. It shows that a current of one sign lacks its
+sign, and that charge and discharge follow each other without a rest in a load."""
 MIN_REVERSAL = 0.03
 """Minimum change of the voltage against the direction of a load, in a stretch of constant current, relative to the voltage.
 Recovery after a larger current, and warming of a cold cell, change it less."""
