@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.protocols.base.device_clock import MAX_LEAD_S, START_S, DeviceClock
+from bms_estimator.protocols.base.device_clock import MAX_FIRST_BACKLOG_S, MAX_LEAD_S, DeviceClock
 from bms_estimator.protocols.devices.text import TextProtocol
 
 
@@ -92,7 +92,7 @@ def test_no_timestamps_make_the_time_lead_the_arrivals_by_more_than_a_constant(
     for step_s, offset_s in itertools.islice(zip(itertools.cycle(steps_s), itertools.cycle(offsets_s)), 500):
         lead_s = clock.sample_time(arrival_s, rate * arrival_s + offset_s) - arrival_s
         assert lead_s <= start_lead_s + MAX_LEAD_S + 1e-6
-        if arrival_s <= START_S:  # a backlog that is being sent at the first sample
+        if arrival_s <= MAX_FIRST_BACKLOG_S:  # a backlog that is being sent at the first sample
             start_lead_s = max(start_lead_s, lead_s)
         arrival_s += step_s
 
