@@ -36,8 +36,7 @@ from tests.free_port import free_port
 from tests.page.chromium import DESKTOP, PHONE, Tab, chromium, tab
 from tests.page.test_setup import answer_questions, compare_voltage, search_and_choose
 from tests.patience import LONG_S
-from tests.scripted_source import Collector, ScriptedSource
-from tests.store.test_history import record_history
+from tests.scripted_source import ScriptedSource
 
 DOCS = Path(__file__).parents[2] / "docs" / "images"
 CELLS, CAPACITY_AH = 16, 280.0
@@ -86,28 +85,22 @@ class House:
         self.days, self.hour, self.time_s, self.charger_a = days, hour, 0.0, 0.0
         self.published_s = 0.0
         self.begin_s = time.time() - 86_400.0 * days
-        self.collector = Collector()
 
     @contextlib.asynccontextmanager
     async def page(self, folder: Path) -> AsyncIterator[str]:
         """Simulate the battery, and serve its page. Yield the URL."""
-        page, history = PageSettings(listen=f"127.0.0.1:{free_port()}"), folder / f"{free_port()}.sqlite"
-        async with PageSink(Pages(), page, "home", history) as sink:
+        page = PageSettings(listen=f"127.0.0.1:{free_port()}")
+        async with PageSink(Pages(), page, "home", folder / "none") as sink:
             clock = Clock(wall=lambda: self.begin_s + self.published_s, monotonic=lambda: self.published_s)
-            publisher = Publisher(
-                self.settings, self.pack, source=ScriptedSource(), sinks=[self.collector, sink], clock=clock
-            )
+            publisher = Publisher(self.settings, self.pack, source=ScriptedSource(), sinks=[sink], clock=clock)
             while (rest_s := 86_400.0 * self.days - LIVE_S - self.time_s) > 0.0:
-                minutes = 60 if rest_s > 86_400.0 else 5
                 with patch.multiple(forecaster, RETRY_S=3600.0, MIN_INTERVAL_S=3600.0, MAX_INTERVAL_S=3600.0):
-                    self.publish(publisher, [self.run(STEP_S) for _ in range(minutes)])
+                    self.publish(publisher, [self.run(STEP_S) for _ in range(60 if rest_s > 86_400.0 else 5)])
             while self.time_s < 86_400.0 * self.days:
                 minute = self.run(1.0)
                 for parts in zip(*(np.split(part, 60) for part in minute), strict=True):
                     self.publish(publisher, [parts])
             publisher.publish_last()
-            day = [each for each in self.collector.snapshots if each.estimate][-288 - int(LIVE_S) :]
-            await record_history(history, day)
             yield f"http://{page.listen}/"
 
     def run(self, step_s: float) -> Parts:
@@ -136,14 +129,10 @@ class House:
         return -self.charger_a if self.charger_a > 0.7 * TAIL_A else 0.0
 
 
-async def shoot(page_tab: Tab, name: str, part: str = "", *, top: bool = False) -> None:
-    """Write a screenshot of the page, of its upper part (``top``), or of one element (``part``, a CSS selector)."""
-    path = DOCS / f"page-{name}.png"
-    if part:
-        await page_tab.page.locator(part).screenshot(path=path)
-    else:
-        clip = {"x": 0, "y": 0, "width": DESKTOP["width"], "height": TOP_PX}
-        await page_tab.page.screenshot(path=path, **({"clip": clip} if top else {"full_page": True}))
+async def shoot(page_tab: Tab, name: str, *, top: bool = False) -> None:
+    """Write a screenshot of the page, or of its upper part (``top``)."""
+    path, clip = DOCS / f"page-{name}.png", {"x": 0, "y": 0, "width": DESKTOP["width"], "height": TOP_PX}
+    await page_tab.page.screenshot(path=path, **({"clip": clip} if top else {"full_page": True}))
     sys.stdout.write(f"{path.relative_to(DOCS.parents[1])}: {path.stat().st_size / 1e3:.0f} kB\n")
 
 
@@ -156,31 +145,24 @@ async def open_page(browser: Browser, url: str, **options: Any) -> AsyncIterator
         yield page_tab
 
 
-async def shoot_first_day(folder: Path, browser: Browser) -> None:
-    """Write screenshots of the first minutes, in which the SOC is not known without that of the BMS, and is with it."""
-    for name, std in (("unknown", None), ("first", 0.1)):
-        pack = {key: value for key, value in SETTINGS["pack"].items() if key != "device_soc_std" or std}
-        async with House(0.02, 0.55, 20.0, pack=pack).page(folder) as url, open_page(browser, url) as page_tab:
-            await shoot(page_tab, f"{name}", top=True)
+async def shoot_unknown(folder: Path, browser: Browser) -> None:
+    """Write a screenshot of the first minutes without the SOC of the BMS."""
+    pack = {key: value for key, value in SETTINGS["pack"].items() if key != "device_soc_std"}
+    async with House(0.02, 0.55, 20.0, pack=pack).page(folder) as url, open_page(browser, url) as page_tab:
+        await shoot(page_tab, "unknown", top=True)
 
 
-async def shoot_weeks(folder: Path, browser: Browser) -> None:
+async def shoot_week(folder: Path, browser: Browser) -> None:
     """Write screenshots of a pack after a week, discharging."""
     async with House(7.0, 0.6, 20.0).page(folder) as url:
         async with open_page(browser, url) as page_tab:
             await shoot(page_tab, "desktop")
-            await shoot(page_tab, "cells", ".cells")
-            await page_tab.page.get_by_text("Day", exact=True).click()
-            await page_tab.page.get_by_role("img", name="Voltage, last day: from").wait_for()
-            await shoot(page_tab, "day", ".curves")
-            await page_tab.page.get_by_text("For experts").click()
-            await page_tab.page.locator("#params tr").nth(3).wait_for()
-            await shoot(page_tab, "expert", "#expert")
         async with open_page(browser, url, size=PHONE, device_scale_factor=1.5) as page_tab:
             await shoot(page_tab, "phone")
-        async with open_page(browser, url, color_scheme="dark") as page_tab:
-            await shoot(page_tab, "dark")
-    # the page is open while its service ends
+
+
+async def shoot_stale(folder: Path, browser: Browser) -> None:
+    """Write a screenshot of a page that is open while its service ends."""
     async with contextlib.AsyncExitStack() as stack:
         service = contextlib.AsyncExitStack()
         url = await service.enter_async_context(House(0.1, 0.6, 20.0).page(folder))
@@ -190,11 +172,9 @@ async def shoot_weeks(folder: Path, browser: Browser) -> None:
         await shoot(page_tab, "stale", top=True)
 
 
-async def shoot_states(folder: Path, browser: Browser) -> None:
-    """Write screenshots of a pack that is charged, and of one with alarms."""
-    async with House(1.0, 0.6, 11.0).page(folder) as url, open_page(browser, url) as page_tab:
-        await shoot(page_tab, "charging", top=True)
-    alarms = {"soc_low": {"limit": 0.9, "delay_s": 1}, "cell_imbalance": {"limit_v": 0.002, "delay_s": 1}}
+async def shoot_alarm(folder: Path, browser: Browser) -> None:
+    """Write a screenshot of a pack with alarms."""
+    alarms = {"soc_low": {"limit": 0.6, "delay_s": 1}, "cell_imbalance": {"limit_v": 0.002, "delay_s": 1}}
     async with House(1.0, 0.5, 6.0, alarms=alarms).page(folder) as url, open_page(browser, url) as page_tab:
         await page_tab.page.locator(".alarm").first.wait_for()
         await shoot(page_tab, "alarm", top=True)
@@ -223,7 +203,7 @@ async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         async with chromium() as browser:
-            for shots in (shoot_first_day, shoot_weeks, shoot_states, shoot_setup):
+            for shots in (shoot_unknown, shoot_week, shoot_stale, shoot_alarm, shoot_setup):
                 await shots(folder, browser)
 
 
