@@ -179,8 +179,8 @@ SLOWDOWN = 500.0
 """Divisor of the weights in the adaptive law (3.18) of the thesis. With the printed weights, the law moves a1..a12 to their limits
 within half a second, too fast to be watched. A common divisor slows it down and leaves the limits unchanged."""
 REST_S = 60.0
-"""Rest of the cell while a1..a12 move [s]. R_s by (4.2) can be computed only after they have reached their limits, and only from a
-rest on, at which the RC voltages are known."""
+"""Rest of the cell while a1..a12 move [s]; a10, the slowest, then still lacks 8 % of its limit. R_s by (4.2) can be computed only
+from such a rest on, at which the RC voltages are known."""
 RESOLUTION_V = 5e-3
 """Resolution of the board's voltage [V]. The board averages noisy conversions, so that it is a fifth of the converter's
 step."""
