@@ -178,8 +178,8 @@ SLOWDOWN = 500.0
 """Divisor of the weights in the adaptive law (3.18) of the thesis. With the printed weights, the law moves a1..a12 to their limits
 within half a second, too fast to be watched. A common divisor slows it down and leaves the limits unchanged."""
 REST_S = 60.0
-"""Rest of the cell at the start, in which a1..a12 reach their limits [s]. R_s by (4.2) is computed only after that. It requires
-the RC voltages, which are known after a rest."""
+"""Rest of the cell at the start [s]. R_s by (4.2) requires the RC voltages, which are known after a rest. Of a1..a12, a10 moves
+slowest, and is then still 8 % from its limit."""
 RESOLUTION_V = 5e-3
 """Resolution of the board's voltage [V]. It is a fifth of the converter's step, because the board averages noisy
 conversions."""

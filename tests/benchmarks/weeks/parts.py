@@ -30,6 +30,8 @@ NO_AGING = Aging(by_use=0.0, by_time=0.0)
 FEW_ROWS = 400
 """Number of rows of a short history. Two weeks have fewer rows than the slow fit allows (``MAX_ROWS``), so that
 old rows are merged only with this lower limit."""
+SHORT_HISTORY: tuple[Patch, ...] = ((history, "MAX_ROWS", FEW_ROWS), (history, "OLD_S", 0.5 * history.DAY_S))
+"""Changes for a short history. It ends within two days, before the rows are as old as those that the slow fit merges (``OLD_S``)."""
 
 
 @dataclass(frozen=True)
@@ -172,9 +174,9 @@ PARTS: dict[str, Part] = {
     "minimum std after a fit": Part(((handover, "MIN_SOC_STD_FRACTION", 0.0),)),
     "std of the voltage gain": Part(gains={"voltage_gain_std": 0.0}),
     "std of the current gain": Part(gains={"current_gain_std": 0.0}),
-    f"rows beyond {FEW_ROWS}, old ones merged": Part(((history, "MAX_ROWS", FEW_ROWS),)),
+    f"rows beyond {FEW_ROWS}, old ones merged": Part(SHORT_HISTORY),
     f"rows beyond {FEW_ROWS}, old ones dropped": Part(
-        ((history, "MAX_ROWS", FEW_ROWS), (history, "thin_old_rows", lambda rows, _: rows))
+        (*SHORT_HISTORY, (history, "thin_old_rows", lambda rows, _: rows))
     ),
 }
 """Changes that disable each part, by its name in the table."""

@@ -26,7 +26,8 @@ INTERVAL_S = 1.25 * DAY_S
 
 
 def everything(rng, pack):
-    """Yield discharges to the cut-off, full charges, unseen charges and long rests, at -5 to 30 C: samples for every part."""
+    """Yield discharges to the cut-off, full charges, unseen charges, long rests, and gaps of 10 min, over which the usual load links
+    the SOC, at -5 to 30 C: samples for every part."""
     hour = HOUR_S // SOLAR_STEP_S
     # every third cycle has a discharge to the cut-off; in the next cycle the charge is unseen
     for count in itertools.count():
@@ -37,6 +38,7 @@ def everything(rng, pack):
             yield Phase(np.full(12 * hour, 0.15 * pack.one_c), "stopped")
             yield Phase(np.zeros(hour))
         yield Phase(np.full(12 * hour, -0.11 * pack.one_c), "stopped", is_seen=count % 3 != 1)
+        yield Phase(np.zeros(hour // 6), is_seen=False)
         yield Phase(np.zeros(6 * hour))
 
 
