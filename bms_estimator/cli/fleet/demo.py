@@ -33,7 +33,7 @@ def demo(
 
     The output explains each step. Three packs send faulty data, which the fleet must name.
     One of the two workers is killed, and the other takes over its packs.
-    The end is a table of measured results.
+    At the end a table with measured results is printed.
     All parts are processes on the loopback interface, with free ports and a temporary folder.
     """
     compile_ahead()

@@ -29,15 +29,15 @@ def status(
         int | None,
         typer.Option(
             min=1,
-            help="end with exit code 1 unless every worker reads this version of blocks; check it before an upgrade of edges",
+            help="version of blocks; end with exit code 1 if a worker does not read it. Check this before you upgrade edges",
             show_default=False,
         ),
     ] = None,
 ) -> None:
     """List the workers with their versions, and what needs attention.
 
-    Listed are errors of workers, refused partitions, unknown packs that send blocks, packs with dead letters, and packs whose edge's
-    clock is wrong. A warning follows if more than half of the stream is filled by blocks that no checkpoint includes.
+    The list contains errors of workers, refused partitions, unknown packs that send blocks, packs with dead letters, and
+    packs whose edge's clock is wrong. A warning follows if more than half of the stream is filled by blocks that no checkpoint includes.
     """
     heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
     print_table(COLUMNS, [_row(each) for each in heartbeats])
