@@ -34,12 +34,13 @@ def everything(rng, pack):
         room_c = rng.uniform(-5.0, 30.0) if count % 3 else 25.0
         yield Phase(drive(rng, pack.one_c, 0.3, 3 * hour), "empty", 0.15, room_c)
         yield Phase(np.zeros(hour), room_c=room_c)
-        yield Phase(np.zeros(hour // 6), is_seen=False)
         if count % 3 == 0:
             yield Phase(np.full(12 * hour, 0.15 * pack.one_c), "stopped")
             yield Phase(np.zeros(hour))
         yield Phase(np.full(12 * hour, -0.11 * pack.one_c), "stopped", is_seen=count % 3 != 1)
-        yield Phase(np.zeros(6 * hour))
+        yield Phase(np.zeros(3 * hour))
+        yield Phase(np.zeros(hour // 6), is_seen=False)
+        yield Phase(np.zeros(3 * hour))
 
 
 @pytest.fixture(scope="module")
