@@ -96,7 +96,7 @@ class ServiceParts:
     """State of the service around the pack; the loop adds its own parts."""
     requests: RequestDispatcher | None = None
     """Dispatcher at which the loop registers its handlers."""
-    current_zero: Callable[[], Awaitable[None]] | None = None
+    store_current_zero: Callable[[], Awaitable[None]] | None = None
     """Makes the board store the present current as zero; None: the source has no such command."""
     board_check: BoardCheck | None = None
     """Reports that the calibration of the board has changed; None: the source has no such check."""
@@ -172,7 +172,7 @@ async def run_estimation_loop(
     keeps_slots = monitor.alarms.active or monitor.alarms.unwatched_critical
     slots = CellSlots(model.cell.series_count, counters.cell_slots if keeps_slots else (), counters.cell_slots)
     if parts.requests is not None:
-        RequestHandlers(pack, publisher, parts.current_zero).register(parts.requests)
+        RequestHandlers(pack, publisher, parts.store_current_zero).register(parts.requests)
     writer = (
         CheckpointWriter(
             pack,

@@ -36,7 +36,6 @@ module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 MINUS, DASH = "\N{MINUS SIGN}", "\N{EN DASH}"
 PACK_SECTION = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
 CELLS_V = (3.311, 3.325, 3.318, 3.322)
-CELLAR_TOPIC = "bms/cellar"
 STATE_VALUES = {  # as published in ``state``
     "soc": 0.4321,
     "soc_percent": 43.21,
@@ -144,7 +143,7 @@ async def programs(folder: Path, broker: Broker) -> AsyncIterator[RunningProgram
 
 async def publish(live: Listener, topic: str, payload: str | bytes, *, retain: bool = True) -> None:
     """Publish a message of the pack ``cellar``."""
-    await live.publish(f"{CELLAR_TOPIC}/{topic}", payload, qos=1, retain=retain)
+    await live.publish(f"bms/cellar/{topic}", payload, qos=1, retain=retain)
 
 
 async def publish_state(live: Listener, **values: Any) -> dict[str, Any]:
@@ -161,11 +160,6 @@ async def dashboard_of(browser: Browser, programs: RunningPrograms, pack: str, *
     async with tab(browser, f"{programs.dashboard}#{pack}", **options) as page_tab:
         await page_tab.until("name => document.getElementById('name').textContent === name", pack)
         yield page_tab
-
-
-def format_time(time: str) -> str:
-    """Format a time as a browser on this machine does."""
-    return datetime.fromisoformat(time).astimezone().strftime("%H:%M:%S")
 
 
 async def test_page_shows_the_published_values_with_units(browser: Browser, programs: RunningPrograms) -> None:
@@ -337,7 +331,8 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
             assert await page_tab.text("celllow") == "3.311 V · cell 1"
             assert re.search(r"in series · nominal [\d.]+ V · ", await page_tab.page.inner_text("#what"))
             await page_tab.until(
-                "count => document.querySelectorAll('#params tr').length === count", count_parameters(parameters)
+                "count => document.querySelectorAll('#params tr').length === count",
+                sum(len(parameters[group]) for group in ("a", "elements", "state_of_health")),
             )
             assert await page_tab.text("capacity_health") == "not known yet"
             await page_tab.page.get_by_text("For experts").click()
@@ -359,10 +354,6 @@ def format_parameter(parameter: dict[str, Any]) -> str:
         return f"{parameter['value']:.4g}"
     decimals = 1 - math.floor(math.log10(parameter["std"]))
     return f"{parameter['value']:.{decimals}f}"
-
-
-def count_parameters(parameters: dict[str, Any]) -> int:
-    return sum(len(parameters[group]) for group in ("a", "elements", "state_of_health"))
 
 
 async def test_packs_spans_and_elements_are_selected_by_keyboard(browser: Browser, programs: RunningPrograms) -> None:
@@ -562,7 +553,7 @@ async def test_page_is_stale_while_the_sensor_or_the_service_is_offline(
         )
         await publish(programs.live, "health", offline.model_dump_json())
         await publish(programs.live, "sensor/availability", b"offline")
-        await page_tab.until_status(f"stale since {format_time(state['time'])}")
+        await page_tab.until_status(f"stale since {datetime.fromisoformat(state['time']).astimezone():%H:%M:%S}")
         assert "the board is silent" in await page_tab.page.inner_text("#why")
         await publish(programs.live, "sensor/availability", b"online")
         await publish(programs.live, "health", CELL_SNAPSHOT.health.model_dump_json())
