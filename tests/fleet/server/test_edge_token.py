@@ -31,7 +31,7 @@ RAW_BYTES = 8 << 20
 FLOOD_BLOCKS = 40
 """Number of blocks that an attacker sends. Each of them takes a worker a tenth of a second."""
 FLOOD_BYTES = 715_000
-"""Total size of the blocks with too many samples that an attacker sends [bytes]."""
+"""Total size of the blocks with too many samples that an attacker sends [bytes]. It gives the number of blocks."""
 MQTT_FAILURE = 0x80
 """Return code of a rejected MQTT subscription."""
 FORMER_SUBJECT = "p.*.raw.*"
