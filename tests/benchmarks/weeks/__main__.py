@@ -38,7 +38,7 @@ KINDS: dict[str, tuple[Case, ...]] = {
     ),
     "aging": (Case("LG M50", "full_nightly", aging=FAST),),
 }
-"""Cases by kind."""
+"""Cases by kind. A kind is named by its cells, its use or its source."""
 Scores = dict[tuple[str, str], list[Score]]
 """Scores by part and kind."""
 

@@ -177,6 +177,7 @@ async def test_blocks_with_too_many_samples_are_rejected_and_other_packs_are_not
         async with Heartbeats(reader) as heartbeats, worker(fleet):
             assert (await states.next_msg(LONG_S)).subject == subjects.published("p1", "state")
             await wait_for_count(heartbeats, "too_dense", count)
+    # the worker logs only the first rejection of a pack
     rejections = [line for line in logs if line["event"] == "a block is rejected"]
     assert [(line["pack"], line["reason"]) for line in rejections] == [("attacker", reason)]
     await admin.close()
