@@ -39,10 +39,10 @@ def ladder_prior(cell: CellModel, scale_ohm: float, *, refine_ocv: bool, spans_t
         spans_temperature: True if the captures give activation energies and dE/dT.
     """
     series, given = cell.cell.series_count, cell.ladder
-    entropy_v = PER_KELVIN_STD_V if _per_kelvin(cell) is None else MEASURED_PER_KELVIN_STD_V
+    per_kelvin_std_v = PER_KELVIN_STD_V if _per_kelvin(cell) is None else MEASURED_PER_KELVIN_STD_V
     return Prior(
         ocv_error_v=_curve_error(cell) if refine_ocv else np.full(EVEN_SOC.size, FIXED_OCV_STD_V),
-        per_kelvin_v=(entropy_v if spans_temperature and refine_ocv else FIXED_PER_KELVIN_STD_V) * series,
+        per_kelvin_std_v=(per_kelvin_std_v if spans_temperature and refine_ocv else FIXED_PER_KELVIN_STD_V) * series,
         scale_ohm=scale_ohm,
         series=series,
         shapes=_shapes(cell, scale_ohm),
