@@ -137,7 +137,7 @@ def forecast(
     if forecaster is None:
         raise UserError(f"{model.cell.name}: a forecast needs a battery, and identifier.enabled = true in the settings")
     result = forecaster.forecast(trip.load if trip else None)
-    curve = forecaster.trip_curve(trip.load) if trip and trip.has_end else None
+    curve = forecaster.given_load_curve(trip.load) if trip and trip.has_end else None
     outcome = trip_outcome(trip, curve) if trip and curve else None
     if plot is not None:
         _write_plot(plot, start.name, curve or result.curve, forecaster.cutoff_v)
