@@ -13,16 +13,21 @@ out, because rests separate them: with their prior and currents of 0.4 C the std
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR_V, MAX_SLOPE_V
 from bms_estimator.kernels.accumulators.history import ROW_SOC
+from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.model.arrays import Floats
+from bms_estimator.model.payloads.health import SocBound
 from bms_estimator.pack_model.cell_curves import DIRECTION_STD_RANGE_V, SOC_GRID, CellCurves
+from bms_estimator.pack_model.fit import PackFit, rows_of_this_pack
 from bms_estimator.pack_model.prior import (
     DIRECTION_CORRELATION_SOC,
     ENTROPY_STD_V,
@@ -31,7 +36,10 @@ from bms_estimator.pack_model.prior import (
     NEW_SEGMENT_STD,
     curve_covariance,
 )
+from bms_estimator.pack_model.solve import single_threaded
 
+MIN_WINDOW = 0.05
+"""Minimum width of a window [SOC]."""
 DISCHARGE_C = 0.4
 """Assumed C-rate of the discharges if charges are not measured. The offset of the current sensor is then an error of the
 capacity."""
@@ -64,6 +72,27 @@ class Window:
         """SOCs of the history's rows, evenly spaced."""
         high = 1.0 if self.full else self.high
         return np.linspace(self.low, high, max(round((high - self.low) / ROW_SOC), 1) + 1)
+
+
+def window_of_history(rows: NDArray[np.void], fitted: PackFit | None, *, has_temperature: bool) -> Window:
+    """Return the window of a pack's history. Without rows it is empty.
+
+    Args:
+        rows: Shape (n,), dtype HISTORY_ROW.
+        fitted: Fit of the rows; None: their SOC is that of the filter.
+        has_temperature: True: the temperature is measured.
+    """
+    rows = rows_of_this_pack(rows, fitted)
+    if not rows.size:
+        return Window(0.0, 0.0, has_temperature=has_temperature)
+    soc = np.clip(rows["soc"] if fitted is None else fitted.row_soc, 0.0, 1.0)
+    return Window(
+        float(soc.min()),
+        float(soc.max()),
+        full=bool((rows["reference_kind"] == FULL).any()),
+        charge_seen=bool((rows["current_a"] < 0.0).any()),
+        has_temperature=has_temperature,
+    )
 
 
 class Accuracy:
@@ -140,6 +169,21 @@ class Accuracy:
     def mean_std(self) -> float:
         """Mean of the std over the window."""
         return float(self.std(self.soc).mean())
+
+
+@single_threaded()
+def with_soc_bound(fitted: PackFit, cell: CellCurves, rows: NDArray[np.void], has_temperature: bool) -> PackFit:
+    """Return a fit of rows with the bound of their use; unchanged if the use is narrow or has no finite bound.
+
+    A bound that cannot be computed must not make the fit fail.
+    """
+    window = window_of_history(rows, fitted, has_temperature=has_temperature)
+    if window.high - window.low >= MIN_WINDOW:
+        with suppress(np.linalg.LinAlgError, ValueError):  # also of pydantic, for a value that is not finite
+            change, std = next(iter(improvements(cell, window).items()), (None, None))
+            bound_std = Accuracy(cell, window).mean_std
+            return replace(fitted, soc_bound=SocBound(std=bound_std, change=change, changed_std=std))
+    return fitted
 
 
 def improvements(cell: CellCurves, window: Window) -> dict[str, float]:

@@ -17,6 +17,7 @@ from bms_estimator.kernels.kalman_filter.records import NODES
 from bms_estimator.kernels.pack_voltage import CURVE_NODES, SHAPE_NODES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.payloads.health import SocBound
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves, NodePosition
 from bms_estimator.pack_model.equations import Equations, Residuals
 from bms_estimator.pack_model.prediction import Reference
@@ -107,6 +108,8 @@ class PackFit:
     """True: the pack was exchanged in the gap before the last segment, so that only this segment is fitted."""
     faults: InputFault = field(default=InputFault(0))
     """Faults that the fitted values show."""
+    soc_bound: SocBound | None = None
+    """Lower bound of the std of the SOC in the use of the rows, which is not saved; None: not computed."""
 
 
 FINITE_FIELDS = tuple(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.kernels.kalman_filter.hypotheses import MAX_STD_OF_ONE_HYPOTHESIS
+from bms_estimator.pack_model.accuracy import with_soc_bound
 from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import SOC as FIT_SOC
@@ -253,10 +254,11 @@ class SlowFit:
     def _begin_fit(self) -> None:
         """Begin a fit if there is enough new data with known currents, and set the time of the next event."""
         h = self._history_state
-        rows, previous = self.history.rows, self.saved_fit
+        rows, previous, cell = self.history.rows, self.saved_fit, self.cell
         if has_enough_data(rows, self._new_rows, previous):
             self._new_rows, self._fitted_rows = 0, rows
-            self._pending = self._submit(lambda: fit(self.cell, rows, previous))
+            has_temperature = bool(self.estimator.record[0]["filter"]["sensed"])
+            self._pending = self._submit(lambda: with_soc_bound(fit(cell, rows, previous), cell, rows, has_temperature))
             self.estimator.schedule(h["elapsed_s"] + ADOPT_DELAY_S)
             return
         self.estimator.schedule(h["elapsed_s"] + self.interval())

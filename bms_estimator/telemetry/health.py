@@ -73,6 +73,7 @@ def pack_model_health(model: SlowFit, times: FitTimes) -> PackModelHealth:
         last_fit=None if times.finished_s is None else iso_utc(times.finished_s),
         last_fit_s=times.duration_s,
         change=last_change(model),
+        soc_bound=model.saved_fit and model.saved_fit.soc_bound,
     )
 
 

@@ -1,17 +1,21 @@
 """Lower bound of the std of the SOC: its documented table, its limits, and a simulation."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.kernels.accumulators.history import HISTORY_ROW
+from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements
+from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements, window_of_history, with_soc_bound
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.prior import DIRECTION_CORRELATION_SOC, curve_covariance
 from bms_estimator.pack_model.unknowns import DIRECTIONS
+from tests.pack_model.quick_fit import quick_fit
 
 PAGE = Path(__file__).parents[2] / "docs" / "theory" / "observability.md"
 CELLS = ("nmc", "nca", "lmo", "lfp", "ncr18650")
@@ -89,6 +93,23 @@ def test_each_change_lowers_the_std_of_an_lfp_pack_that_is_never_full() -> None:
     assert [*stds] == ["a full charge each week", "a measured OCV curve", "discharges to 10%", "a temperature sensor"]
     assert list(stds.values()) == sorted(stds.values())
     assert max(stds.values()) < present
+
+
+def test_a_fit_carries_the_bound_and_the_best_change_of_the_use_since_the_last_exchange() -> None:
+    cell, rows = curves("lfp"), np.zeros(40, HISTORY_ROW)
+    rows["segment"], rows["soc"], rows["current_a"] = np.arange(40) // 20, np.linspace(0.5, 0.9, 40), 1.0
+    rows["reference_kind"][0], rows["current_a"][-1] = FULL, -1.0
+    assert window_of_history(rows, None, has_temperature=True) == Window(0.5, 0.9, full=True)
+    fitted = replace(quick_fit(cell, rows[20:]), first_segment=1.0)
+    window = window_of_history(rows, fitted, has_temperature=False)
+    assert window == Window(rows["soc"][20], 0.9, full=False, has_temperature=False)
+    bound, stds = with_soc_bound(fitted, cell, rows, has_temperature=False).soc_bound, improvements(cell, window)
+    assert bound
+    assert (bound.std, bound.change, bound.changed_std) == (
+        Accuracy(cell, window).mean_std,
+        *min(stds.items(), key=lambda s: s[1]),
+    )
+    assert with_soc_bound(quick_fit(cell, rows[:2]), cell, rows[:2], has_temperature=True).soc_bound is None
 
 
 def test_changes_in_force_are_not_proposed() -> None:

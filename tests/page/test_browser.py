@@ -217,6 +217,26 @@ async def test_the_forecast_is_shown_as_curves_and_with_its_band(browser: Browse
         assert page_tab.errors == []
 
 
+async def test_a_change_that_lowers_the_bound_of_the_std_by_a_fifth_is_named(
+    browser: Browser, programs: RunningPrograms
+) -> None:
+    health = CELL_SNAPSHOT.health.model_dump()
+    async with dashboard_of(browser, programs, "cellar") as page_tab:
+        await publish_state(programs.live, **STATE_VALUES)
+        for changed_std, ends in ((0.015, "to ± 3 %, instead of ± 8 % at best in the present use."), (0.035, "")):
+            bound = {"std": 0.04, "change": "a full charge each week", "changed_std": changed_std}
+            await publish(programs.live, "health", json.dumps(health | {"pack_model": {"soc_bound": bound}}))
+            await page_tab.until(
+                """ends => {
+                const line = document.getElementById("whathelps");
+                return line.checkVisibility() === !!ends && line.innerText.endsWith(ends);
+            }""",
+                ends,
+            )
+        await publish(programs.live, "health", json.dumps(health))
+        assert page_tab.errors == []
+
+
 async def test_below_ten_minutes_the_page_shows_the_band_and_no_single_time(
     browser: Browser, programs: RunningPrograms
 ) -> None:

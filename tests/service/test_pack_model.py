@@ -142,6 +142,8 @@ async def test_service_and_replay_agree_to_the_last_bit(
     assert slow_fit.fits >= 3
     assert (live.model.fits, live.model.late, live.model.failed) == (slow_fit.fits, 0, 0)
     assert live.estimator.settings_record.tobytes() == replayed.settings_record.tobytes()
+    assert slow_fit.saved_fit
+    assert live.model.soc_bound == slow_fit.saved_fit.soc_bound is not None
     same_fields(live.estimator, replayed)
     same_forecasts(live.sink.snapshots, step.trace, step.forecasts)
 

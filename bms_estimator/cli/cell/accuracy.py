@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from bms_estimator.checkpoint.state_files import StateFiles
@@ -19,13 +18,11 @@ from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.pack_model.accuracy import Accuracy, Window, improvements
+from bms_estimator.pack_model.accuracy import MIN_WINDOW, Accuracy, Window, improvements, window_of_history
 from bms_estimator.pack_model.cell_curves import CellCurves
+from bms_estimator.pack_model.history import History
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.pack import Settings
-
-MIN_WINDOW = 0.05
-"""Minimum width of a window [SOC]."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +76,8 @@ def accuracy(
         raise UserError("give --pack pack.toml, or --cell NAME with --between LOW HIGH")
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     model.battery(f"{model.cell.name}: a fuel cell has no SOC")
-    present_std, full_charges = None, None
-    if pack is None:
-        window = Window(0.0, has_temperature=False)
-    else:
+    window, present_std, full_charges = Window(0.0, has_temperature=False), None, None
+    if pack is not None:
         compile_ahead()
         window, present_std, full_charges = _window_of_pack(settings, model)
     if between is not None:
@@ -121,15 +116,9 @@ def _window_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float
         UserError: There is no checkpoint.
     """
     saved = StateFiles(state_folder(settings), settings, model).saved_pack().pack
-    slow_fit, has_temperature = saved.slow_fit, bool(saved.estimator.record[0]["filter"]["sensed"])
-    if slow_fit is None or slow_fit.history.rows.size == 0:
-        return Window(0.0, 0.0, has_temperature=has_temperature), saved.estimator.soc_std, 0
-    rows, fit = slow_fit.history.rows, slow_fit.saved_fit
-    soc = np.clip(rows["soc"] if fit is None else fit.row_soc, 0.0, 1.0)
-    full_charges = int((rows["reference_kind"] == FULL).sum())
-    is_charge_seen = bool((rows["current_a"] < 0.0).any())
-    window = Window(float(soc.min()), float(soc.max()), full_charges > 0, is_charge_seen, has_temperature)
-    return window, saved.estimator.soc_std, full_charges
+    history, fit = (saved.slow_fit.history, saved.slow_fit.saved_fit) if saved.slow_fit else (History(), None)
+    window = window_of_history(history.rows, fit, has_temperature=bool(saved.estimator.record[0]["filter"]["sensed"]))
+    return window, saved.estimator.soc_std, int((history.rows["reference_kind"] == FULL).sum())
 
 
 def _print(result: AccuracyResult) -> None:

@@ -17,6 +17,14 @@ class FitReport(Payload):
     capacity_after_ah: float = Field(description="capacity after the fit was adopted [Ah]")
 
 
+class SocBound(Payload):
+    """Lower bound of the standard deviation of the SOC in the use of a pack, and the change that lowers it most."""
+
+    std: float = Field(description="smallest possible standard deviation of the SOC, mean over the use")
+    change: str | None = Field(description="change of use or sensors that lowers it most; null: no change is possible")
+    changed_std: float | None = Field(description="smallest possible standard deviation after this change")
+
+
 class PackModelHealth(Payload):
     """Fit of the pack's model to its history; counters since start."""
 
@@ -36,6 +44,10 @@ class PackModelHealth(Payload):
     last_fit: str | None = Field(description="time at which the last fit ended, ISO 8601, UTC; null: none since start")
     last_fit_s: float | None = Field(description="duration of the last fit [s]")
     change: FitReport | None = Field(description="the last of the changes; null: none since start")
+    soc_bound: SocBound | None = Field(
+        default=None,
+        description="how well the SOC can be known in the present use; null before the first fit since start",
+    )
 
 
 class Totals(Payload):

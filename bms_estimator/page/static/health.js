@@ -2,6 +2,7 @@
 import { $, changed, hide, node, text } from "./dom.js";
 import * as f from "./format.js";
 
+const MAX_FRACTION = 0.8; // of the present bound of the std: a change that lowers it less is not worth a line
 const rows = {};
 
 export function drawHealth({ topics: { health: h, info, state } }) {
@@ -25,6 +26,14 @@ export function drawHealth({ topics: { health: h, info, state } }) {
 		hide(row, !value && value !== 0);
 		text(row.lastChild, f.isNumber(value) ? value.toLocaleString("en") : value || "");
 	}
+}
+
+/** The change of use or sensors that lowers the bound of the std most. */
+export function drawWhatHelps({ std, change, changed_std: changed } = {}) {
+	const band = (x) => `± ${f.percent(2 * x, 0)} %`;
+	const helps = change && changed <= MAX_FRACTION * std && band(changed) !== band(std);
+	hide($("whathelps"), !helps);
+	text($("whathelps"), helps ? `What would help: ${change}. The SOC could then be known to ${band(changed)}, instead of ${band(std)} at best in the present use.` : "");
 }
 
 export function drawEvents(pack) {

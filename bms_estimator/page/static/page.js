@@ -5,7 +5,7 @@ import { $, attribute, changed, hide, node, text } from "./dom.js";
 import { describeElement, drawElement, redrawElement } from "./elements.js";
 import { charts, drawForecast, drawForecastValues } from "./forecast.js";
 import * as f from "./format.js";
-import { drawEvents, drawHealth } from "./health.js";
+import { drawEvents, drawHealth, drawWhatHelps } from "./health.js";
 import { listen } from "./live.js";
 import { connection, packs, receive } from "./packs.js";
 import { drawParameters } from "./parameters.js";
@@ -41,6 +41,7 @@ function draw() {
 	drawRanks(pack.topics.cells, capacity);
 	drawParameters(pack.topics.parameters);
 	drawHealth(pack);
+	drawWhatHelps(pack.topics.health?.pack_model?.soc_bound ?? {});
 	drawEvents(pack);
 	if (now - ui.curves >= CURVES_MS) {
 		ui.curves = now;
