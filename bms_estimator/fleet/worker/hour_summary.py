@@ -27,8 +27,8 @@ REST_C = 0.01
 """Maximum current of a resting pack, as a C-rate [1/h]."""
 
 SIGNIFICANT_STDS = 3.0
-"""Number of std that are subtracted from the deviation of a cell to select the weakest cell and the one with the highest
-resistance."""
+"""Number of std by which the deviation of a cell is reduced before the weakest cell, and the cell with the highest resistance,
+are selected, so that an uncertain estimate does not select its cell."""
 
 Sums = NDArray[np.void]
 """Shape (1,), dtype ``HOUR_SUMS``; all zero before the first block."""
