@@ -35,7 +35,7 @@ Sums = NDArray[np.void]
 
 
 def hour_of(block: Block) -> int:
-    """Return the hour of a block by the edge's clock at its last sample [hours since 1970].
+    """Return the hour of a block on the edge's clock at its last sample [hours since 1970].
 
     A block whose last timestamp is not finite belongs to the hour in which its store was created.
     """
