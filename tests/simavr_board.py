@@ -74,11 +74,6 @@ class FirmwareBoard:
         self.path = ""
         self.exit_code: int | None = None
 
-    @staticmethod
-    def is_built(build: Path) -> bool:
-        """Return True if ``build`` contains the firmware and its simulator."""
-        return all((build / name).is_file() for name in ("board_sim", "bms_board.elf"))
-
     def __enter__(self) -> Self:
         """Start the simulator.
 

@@ -53,5 +53,5 @@ def unit_finding(unit: SystemdUnit) -> Finding:
 def _outcome_text(unit: SystemdUnit) -> str:
     """Return the outcome of a unit's last run as text."""
     if unit.exit_status == os.EX_TEMPFAIL:
-        return f"a fault of the environment, such as a missing folder or file, or another process (status {unit.exit_status})"
+        return f"a fault of the environment, such as a missing file or a second process for the pack (status {unit.exit_status})"
     return f"{unit.result}, status {unit.exit_status}"

@@ -26,7 +26,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.edge import cell_voltages
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
@@ -107,7 +106,7 @@ def encode(block: Block) -> bytes:
         block.arrival_s,
     )
     columns = [np.ascontiguousarray(block.samples[name], dtype=dtype) for name, dtype in _columns(version)]
-    columns[0] = _differences(columns[0].view("<u8"))
+    columns[0] = np.diff(columns[0].view("<u8"), prepend=np.uint64(0))
     body = [column.tobytes() for column in columns]
     if cells:
         body.append(cell_voltages.encode_cells(block.cells_v))
@@ -220,7 +219,3 @@ def _decode_samples(raw: bytes, count: int, columns: Sequence[tuple[str, np.dtyp
         samples["temperature_min_c"] = samples["temperature_max_c"] = samples["temperature_c"]
     samples["time_s"] = np.cumsum(samples["time_s"].view("u8"), dtype="u8").view("f8")
     return samples
-
-
-def _differences(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    return np.diff(values, prepend=values.dtype.type(0))

@@ -45,18 +45,20 @@ def write_fitted_state(f: np.void, p: np.void, state: FittedState) -> None:
         p: Record of dtype EKF_SETTINGS with the fitted curves.
         state: Results of the fit.
     """
-    f["learned_soc"] = p["learning_soc"]  # the first pass is complete: voltages change neither capacity nor curve
+    f["learned_soc"] = p[
+        "learning_soc"
+    ]  # from now on voltages change neither capacity nor curve, because the fit has used them
     if state.soc is None:
-        for q in range(int(f["count"])):
-            _write_parameters(f["mean"][q], f["covariance"][q], state, p, FIRST_PARAMETER)
+        for i in range(int(f["count"])):
+            _write_parameters(f["mean"][i], f["covariance"][i], state, p, FIRST_PARAMETER)
         return
     if f["best"] != 0:
         copy_hypothesis(f, int(f["best"]), 0)
     f["mean"][0][SOC] = np.clip(state.soc, MIN_SOC, MAX_SOC)
     _write_parameters(f["mean"][0], f["covariance"][0], state, p, 0)
     f["count"], f["best"], f["ln_weight"][0] = 1, 0, 0.0
-    for q in range(1, HYPOTHESES):
-        clear_hypothesis(f, q)
+    for i in range(1, HYPOTHESES):
+        clear_hypothesis(f, i)
     mixture_moments(f)
 
 

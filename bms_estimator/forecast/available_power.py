@@ -67,13 +67,13 @@ class PowerLimits:
         return self.charge_a if temperature_c >= self.charge_min_c else 0.0
 
 
-def cell_power_limits(cell: PackModel) -> PowerLimits:
+def cell_power_limits(pack: PackModel) -> PowerLimits:
     """Return the limits of a pack without settings: ``current_max_a`` of the cell file in both directions.
 
     Args:
-        cell: Model of the whole pack.
+        pack: Model of the whole pack.
     """
-    max_a, one_c_a = cell.cell.current_max_a, cell.one_c_a
+    max_a, one_c_a = pack.cell.current_max_a, pack.one_c_a
     return PowerLimits(
         max_a,
         max_a,

@@ -18,9 +18,9 @@ from bms_estimator.forecast.load_history import MINUTE_S, LoadHistory, PastMinut
 from bms_estimator.forecast.projection import (
     Projection,
     discharges,
-    given_load_curve,
     project_given_load,
     project_observed_load,
+    project_until_load_end,
     time_quantiles,
 )
 from bms_estimator.model.arrays import Floats, Records
@@ -89,7 +89,7 @@ class Forecaster:
         return first if due.size and due[first] else None
 
     def add(self, trace: TraceBlock, deviations: CellDeviations | None) -> None:
-        """Add estimates, from which the load is observed, and set the deviations of the single cells."""
+        """Add estimates to the observed load, and replace the deviations of the single cells."""
         self.load.add(trace)
         self.deviations = deviations
 
@@ -150,7 +150,9 @@ class Forecaster:
 
     def given_load_curve(self, load: GivenLoad) -> ForecastCurve | None:
         """Return the curves from the present state until the end of a given load; None without a state."""
-        return None if self._reason_without_state() else given_load_curve(self.projected_pack(load), load, self.seed)
+        return (
+            None if self._reason_without_state() else project_until_load_end(self.projected_pack(load), load, self.seed)
+        )
 
     def projected_pack(self, load: GivenLoad | None = None) -> Records:
         """Return the pack from which a projection starts, shape (1,), dtype ``PROJECTED_PACK``.

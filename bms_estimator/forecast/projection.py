@@ -201,7 +201,7 @@ def time_quantiles(time_s: Floats) -> tuple[float, float, float]:
     return low_s, median_s, high_s
 
 
-def given_load_curve(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
+def project_until_load_end(pack: Records, load: GivenLoad, seed: int) -> ForecastCurve:
     """Return the curves until the end of a load. Their last point is that end.
 
     Args:

@@ -63,11 +63,6 @@ FINAL_CODES = {
 """Reason codes of permanent rejections. All other codes (busy, quota, unspecified) may be temporary."""
 
 
-def is_final(reason: ReasonCode) -> bool:
-    """Return True if a message with this reason will always be rejected."""
-    return reason.value in FINAL_CODES
-
-
 def describe_reason(reason: ReasonCode, section: str) -> str:
     """Return a reason code as text: name, number, hint.
 
@@ -303,7 +298,7 @@ class Client(aiomqtt.Client):
         answer = self._pending_acks.get(mid)
         if answer is not None and not answer.done():
             answer.set_result(
-                PublishRejection(describe_reason(reason_code, self._section), not is_final(reason_code))
+                PublishRejection(describe_reason(reason_code, self._section), reason_code.value not in FINAL_CODES)
                 if reason_code.is_failure
                 else None
             )

@@ -96,7 +96,7 @@ class VoltageModel:
         current_a = np.column_stack([rows["current_a"], rows["x_a"]])
         z = np.clip(reference.soc, 0.0, 1.0)
         ohm = cell.resistances(z, weak, strong)
-        drop_v = sum_by_group(ohm * current_a) @ np.exp(reference.ln_r)
+        drop_v = np.add.reduceat(ohm * current_a, GROUP_STARTS, axis=1) @ np.exp(reference.ln_r)
         terms = np.zeros(rows.size, MODEL_ROW)
         terms["interval"], terms["segment"], terms["direction"] = (
             intervals.of_row,
@@ -219,8 +219,3 @@ def remaining_fraction(rows: NDArray[np.void]) -> Floats:
     from_reset, duration = rows["settled_s"][:, None] / TAUS, np.maximum(rows["duration_s"], 1.0)[:, None] / TAUS
     pairs = np.exp(-from_reset) * -np.expm1(-duration) / duration
     return np.column_stack([np.zeros(rows.size), pairs])
-
-
-def sum_by_group(values: Floats) -> Floats:
-    """Return the sum over the resistances of each group, shape (n, SCALES)."""
-    return np.asarray(np.add.reduceat(values, GROUP_STARTS, axis=1))

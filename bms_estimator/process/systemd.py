@@ -9,7 +9,7 @@ from pathlib import Path
 CREDENTIALS = Path("/run/credentials")
 """Folder with the credentials of all systemd units."""
 START_EXTENSION_S = 120
-"""Extension of the start timeout [s]."""
+"""Time by which each message extends the start timeout of the unit [s]."""
 
 
 class SystemdNotifier:
@@ -17,7 +17,7 @@ class SystemdNotifier:
 
     One process may serve several packs, but is a single service for systemd. A state is therefore sent when
     every pack has reported it. Afterwards every pack must report it again. As a result the service is ready when the last
-    pack is ready, and the watchdog is triggered only while all packs are alive.
+    pack is ready, and the watchdog is fed only while all packs are alive.
 
     Args:
         packs: Names of the packs.
@@ -92,5 +92,6 @@ def is_unreadable_credential(name: Path) -> bool:
 
     The service may be able to read it.
     """
+    # a relative name is looked up in the folder of the credentials
     is_credential = not name.is_absolute() or name.is_relative_to(CREDENTIALS)
     return is_credential and not os.access(credential_path(name), os.R_OK)

@@ -76,9 +76,9 @@ class AlarmHooks:
                 hook.on_alarm_change(change.alarm)
 
     def stop_watching(self) -> None:
-        """Stop setting relays to their level without an alarm, because the alarms are no longer evaluated."""
+        """Stop setting relays to their level without an alarm until alarms are evaluated again."""
         for hook in self._hooks:
-            hook.has_watched = False
+            hook.has_evaluated = False
         self.check_watching = lambda: False
 
     @property
@@ -92,8 +92,8 @@ class AlarmHooks:
         """Restore the alarms of an earlier run.
 
         Jobs of these alarms are not repeated, but the relay is set to its level. A hook that is new, or whose jobs
-        were not finished, runs its jobs. If a hook had failed in the earlier run, all jobs are repeated, so that
-        none is lost.
+        were not finished, runs its jobs. If a hook had failed in the earlier run, all hooks repeat
+        their jobs, so that the failed one is not lost.
 
         Args:
             alarms: All alarms.

@@ -210,7 +210,7 @@ class CheckpointWriter:
             whole: True: write the whole file, not only changes.
         """
         progress = self._progress
-        if not progress[0] or (progress == self._saved_progress and not self._curves_changed):
+        if not progress[0] or (progress == self._saved_progress and self._fit is self._saved_fit):
             return True
         state, fit = self._pack.estimator.record.copy(), self._fit
         curves, cells = curve_arrays(fit), self._pack.cells.saved_state if self._pack.cells else None
@@ -249,11 +249,6 @@ class CheckpointWriter:
         arrays = load_arrays(forecaster.load, forecaster.past)
         if await self._write(lambda: file.save(arrays), file.path):
             self._samples_of_saved_load = samples
-
-    @property
-    def _curves_changed(self) -> bool:
-        """True if the state is relative to other curves than the saved one."""
-        return self._fit is not self._saved_fit
 
     async def _write(self, write: Callable[[], None], path: Path | None = None) -> bool:
         """Call ``write``, which writes ``path`` or the checkpoint, in the disk's thread. Return False if it fails."""

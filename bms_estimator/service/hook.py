@@ -24,14 +24,14 @@ class Hook(ABC):
         failures: Number of failed attempts since start.
         relay_resets: Number of resets of the board that undid a relay command, since start.
         error: Reason why the last attempt failed; empty after a success.
-        has_watched: True after enough samples had arrived to raise all due alarms.
+        has_evaluated: True once enough samples have arrived to raise all due alarms.
     """
 
     def __init__(self, settings: AlarmHook) -> None:
         self.settings = settings
         self.done, self.failures, self.relay_resets, self.error = 0, 0, 0, ""
         self._raised: dict[str, Alarm] = {}  # alarms of this hook that count as raised, by name
-        self.has_watched = False
+        self.has_evaluated = False
         self._wake = asyncio.Event()
         self._closing = False
 

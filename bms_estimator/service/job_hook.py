@@ -73,7 +73,11 @@ class HookJobs:
 
     def next(self) -> Job | None:
         """Return the next job: critical alarms first, then the oldest; None if no job is waiting."""
-        return min(map(self._with_newest_alarm, self._waiting.values()), key=_is_not_critical, default=None)
+        return min(
+            map(self._with_newest_alarm, self._waiting.values()),
+            key=lambda job: job.alarm.severity != "critical",
+            default=None,
+        )
 
     def pop(self) -> Job | None:
         """Remove and return the next job; None if no job is waiting."""
@@ -101,10 +105,6 @@ class HookJobs:
         if job.state == "cleared" or not raised:
             return job
         return job._replace(alarm=min(raised, key=lambda alarm: alarm.severity != "critical"))
-
-
-def _is_not_critical(job: Job) -> bool:
-    return job.alarm.severity != "critical"
 
 
 class JobHook(Hook):

@@ -96,7 +96,7 @@ class ServiceParts:
     """State of the service around the pack. The loop adds the state of its own parts."""
     requests: RequestDispatcher | None = None
     """Dispatcher at which the loop registers its handlers."""
-    current_zero: Callable[[], Awaitable[None]] | None = None
+    store_current_zero: Callable[[], Awaitable[None]] | None = None
     """Makes the board store the present current as zero; None: the source has no such command."""
     board_check: BoardCheck | None = None
     """Reports that the calibration of the board has changed; None: the source has no such check."""
@@ -176,7 +176,7 @@ async def run_estimation_loop(
         model.cell.series_count, slots=counters.cell_slots if keeps_slots else (), earlier=counters.cell_slots
     )
     if parts.requests is not None:
-        RequestHandlers(pack, publisher, parts.current_zero).register(parts.requests)
+        RequestHandlers(pack, publisher, parts.store_current_zero).register(parts.requests)
     writer = (
         CheckpointWriter(
             pack,

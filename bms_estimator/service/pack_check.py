@@ -58,7 +58,7 @@ def check_settings(settings: Settings, cell: PackModel) -> list[str]:
         unreadable, unchecked = _unreadable("influx", settings.influx, "password_file", "token_file")
         warnings += unchecked
         target(settings.influx.model_copy(update=dict.fromkeys(unreadable)))  # raises UserError for invalid credentials
-    for device in (settings, settings.bms_only):
+    for device in (settings, settings.bms_settings):
         if device is not None:
             make_line_producer(device)  # raises an error if [source] is invalid or its optional package is missing
     return warnings
@@ -71,7 +71,7 @@ def summarize(settings: Settings, cell: PackModel) -> str:
     if settings.edge:
         url = settings.edge.url
         broker += f"; samples to {url if isinstance(url, str) else ', '.join(url)}"
-    devices = " and ".join(map(_device_text, filter(None, (settings, settings.bms_only))))
+    devices = " and ".join(map(_device_text, filter(None, (settings, settings.bms_settings))))
     return (
         f"{settings.pack.name}: {ratings.name}, {ratings.series_count} in series, {ratings.nominal_voltage_v:g} V, {cell.capacity_text}; "
         f"{devices}; {broker}"

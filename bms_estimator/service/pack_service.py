@@ -39,7 +39,7 @@ from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.sinks.mqtt.venus_os import configured_limits
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.captures.recorder import CaptureRecorder
-from bms_estimator.sources.factory import open_device, with_bms
+from bms_estimator.sources.factory import open_device, pair_with_bms
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import ReadTap
@@ -52,7 +52,7 @@ log = structlog.get_logger(__name__)
 
 async def run_pack_service(
     settings: Settings,
-    cell: PackModel,
+    model: PackModel,
     *,
     sinks: Sequence[Sink] = (),
     tap: ReadTap | None = None,
@@ -65,7 +65,7 @@ async def run_pack_service(
 
     Args:
         settings: The pack's settings.
-        cell: Model of the whole pack.
+        model: Model of the whole pack.
         sinks: Further sinks, such as the terminal.
         tap: Receives all bytes of the source with their arrival times.
         stop: Event that ends the service. Signals also set it.
@@ -81,12 +81,12 @@ async def run_pack_service(
     """
     stop = stop_on_signal(stop)
     set_level(settings.pack.name, settings.log.level)
-    for line in [*implausible_settings(settings, cell), *implausible_limits(settings, cell)]:
+    for line in [*implausible_settings(settings, model), *implausible_limits(settings, model)]:
         log.warning("implausible setting", pack=settings.pack.name, reason=line)
-    for line in observer_warnings(settings.observer, cell):
+    for line in observer_warnings(settings.observer, model):
         log.warning("condition of the observer fails", pack=settings.pack.name, reason=line)
     database = Database(folder / f"{settings.pack.name}.sqlite") if folder else None
-    delivery = DeliveryStats(store_trouble=lambda: database.reason) if database else DeliveryStats()
+    delivery = DeliveryStats(store_trouble=lambda: database.failure_reason) if database else DeliveryStats()
     all_sinks = [*sinks, *export_sinks(settings)]
     if database and settings.store.history_days:
         all_sinks.append(HistorySink(database, days=settings.store.history_days))
@@ -94,9 +94,9 @@ async def run_pack_service(
     board_file = KnownBoardFile(folder, settings.pack.name) if folder else None
     device = open_device(settings, tap=tap, board_file=board_file)
     board = device if isinstance(device, SerialSource) else None
-    source = with_bms(device, settings)
+    source = pair_with_bms(device, settings)
     outbox = Outbox(database, max_messages=settings.store.outbox_messages)
-    edge = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
+    block_sender = BlockSender(settings.edge, settings.pack.name, folder) if settings.edge and folder else None
     mqtt: MqttSink | None = None
     if settings.mqtt is not None:
         mqtt = MqttSink(
@@ -107,7 +107,7 @@ async def run_pack_service(
             outbox,
             sample_period_s=settings.sensor.sample_period_s,
             home_assistant=settings.home_assistant,
-            alarms=[each.name for each in monitored_alarms(settings, cell)],
+            alarms=[each.name for each in monitored_alarms(settings, model)],
             venus_limits=configured_limits(settings.pack) if settings.mqtt.profile == "venus-os" else None,
         )
         all_sinks.insert(0, mqtt)  # so that no other sink delays the messages
@@ -134,23 +134,23 @@ async def run_pack_service(
         if database:
             await stack.enter_async_context(database)
         await stack.enter_async_context(outbox)
-        if edge:
-            await stack.enter_async_context(edge)
+        if block_sender:
+            await stack.enter_async_context(block_sender)
         estimator = await run_estimation_loop(
             settings,
-            cell,
+            model,
             source=source,
             sinks=all_sinks,
             stop=stop,
-            files=StateFiles(folder, settings, cell) if folder else None,
+            files=StateFiles(folder, settings, model) if folder else None,
             parts=ServiceParts(
                 ServiceStatus(delivery, device.health, partial(recording_health, tap)),
                 requests,
-                device.current_zero,
+                device.store_current_zero,
                 board.board_check if board else None,
                 notifier,
                 hooks,
-                edge,
+                block_sender,
             ),
         )
     log.info("stopped", pack=settings.pack.name, state="saved" if folder else "not saved")
@@ -192,23 +192,23 @@ async def run_pack_services(packs: Sequence[tuple[Settings, PackModel]]) -> None
     """
     names = [settings.pack.name for settings, _ in packs]
     _require_unique("pack.name", names)
-    devices = [each for settings, _ in packs for each in (settings, settings.bms_only) if each is not None]
+    devices = [each for settings, _ in packs for each in (settings, settings.bms_settings) if each is not None]
     sensors = [device.sensor for device in devices if device.source is None]
     _require_unique("sensor.serial", [sensor.serial for sensor in sensors if sensor.serial])
     # several packs may share the port "auto" if each has the serial number of its board
     _require_unique("sensor.port", [sensor.port for sensor in sensors if sensor.port != "auto" or not sensor.serial])
     _require_unique("prometheus.listen", [settings.prometheus.listen for settings, _ in packs if settings.prometheus])
-    for settings, cell in packs:  # before any service starts
+    for settings, model in packs:  # raises a UserError before any service starts
         with _prefixed_errors(settings):
-            monitored_alarms(settings, cell)
+            monitored_alarms(settings, model)
     stop, notifier, pages = stop_on_signal(), SystemdNotifier(names), Pages()
 
-    async def run_one(settings: Settings, cell: PackModel) -> None:
+    async def run_one(settings: Settings, model: PackModel) -> None:
         bind_contextvars(pack=settings.pack.name)
         try:
             with _prefixed_errors(settings):
                 folder = state_folder(settings)
-                await run_pack_service(settings, cell, stop=stop, folder=folder, notifier=notifier, pages=pages)
+                await run_pack_service(settings, model, stop=stop, folder=folder, notifier=notifier, pages=pages)
         finally:
             stop.set()
 

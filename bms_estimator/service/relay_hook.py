@@ -173,8 +173,8 @@ class RelayHook(Hook):
 
     async def _send_level(self) -> str:
         """Send the level that is allowed now. Return the reason why the board does not confirm it; empty if it does."""
-        self.has_watched = self._check_watching() or self.has_watched  # first, because it may raise alarms
-        if not (self._raised or self.has_watched):
+        self.has_evaluated = self._check_watching() or self.has_evaluated  # first, because it may raise alarms
+        if not (self._raised or self.has_evaluated):
             return ""
         level = self._hold.level(high=self._wants_high, now_s=self._clock())
         if level is None:

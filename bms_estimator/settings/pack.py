@@ -259,7 +259,7 @@ class Settings(Strict):
         return tables
 
     @property
-    def bms_only(self) -> Self | None:
+    def bms_settings(self) -> Self | None:
         """Settings whose only device is the one in ``[bms]``; None without this section."""
         if self.bms is None:
             return None

@@ -49,7 +49,7 @@ class BrokerLogin:
         return f"{scheme}://{quote(self.username, safe='')}:{quote(self.password or '', safe='')}@{host}"
 
     def settings(self, password_file: Path | str) -> dict[str, object]:
-        """Return the settings of the broker, with the given file of the password if there is one."""
+        """Return the settings of the broker. With a password they contain the path ``password_file``."""
         values = {"url": self.url, "username": self.username}
         values["password_file"] = None if self.password is None else str(password_file)
         return {key: value for key, value in values.items() if value is not None}

@@ -18,7 +18,7 @@ from bms_estimator.sources.mqtt.payload_value import InvalidValueError, read_cel
 MAX_PUBLISHERS = 1000
 """Maximum number of publishers that are stored. Messages of further publishers are ignored."""
 MIN_LIVE_MESSAGES = 3
-"""Minimum number of messages with a voltage or a current that show how a publisher sends."""
+"""Minimum number of live messages with a voltage or a current from which to conclude that a publisher sends only changes."""
 MAX_SILENT_S = 300.0
 """Setting ``source.max_silent_s`` of a publisher that sends only changes [s]."""
 _PLACEHOLDER = re.compile(r"\{(prefix|instance|cell|probe)\}")
@@ -90,7 +90,7 @@ class PublisherRecognition:
         return [_device(p, complete[p], broker, only_changes=self._sends_only_changes(p)) for p in best]
 
     def _sends_only_changes(self, publisher: Publisher) -> bool:
-        """Return True if most values arrived only as retained messages, others several times, and none was repeated."""
+        """Return True if voltage or current arrived often, no live value was repeated, and most values arrived only as retained ones."""
         live = self._live.get(publisher, {})
         repeated = any(a == b for payloads in live.values() for a, b in itertools.pairwise(payloads))
         is_frequent = max((len(live.get(name, ())) for name in ("voltage", "current")), default=0) >= MIN_LIVE_MESSAGES

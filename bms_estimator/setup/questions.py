@@ -180,18 +180,6 @@ def _parse_series(text: str, answers: Answers) -> object:
     return series
 
 
-def _parse_parallel(text: str, _: Answers) -> object:
-    return _validated(PackSettings, "parallel", _integer(text))
-
-
-def _parse_full_voltage(text: str, answers: Answers) -> object:
-    return None if text == NO_LIMIT else _parse_limit_v("full_voltage_v", text, answers, above_middle=True)
-
-
-def _parse_cutoff_voltage(text: str, answers: Answers) -> object:
-    return None if text == NO_LIMIT else _parse_limit_v("cutoff_voltage_v", text, answers, above_middle=False)
-
-
 def _parse_limit_v(key: str, text: str, answers: Answers, *, above_middle: bool) -> object:
     """Return a voltage limit of the pack [V], above or below its voltage at SOC 0.5.
 
@@ -218,18 +206,6 @@ def _suggest_limit_v(answers: Answers, index: int) -> str:
     if answers.cell not in USUAL_LIMITS_V:
         return NO_LIMIT
     return f"{answers.series * USUAL_LIMITS_V[answers.cell][index]:g}"
-
-
-def _parse_max_discharge(text: str, _: Answers) -> object:
-    return None if text == NO_LIMIT else _validated(PackSettings, "max_discharge_a", parse_number(text, "A"))
-
-
-def _parse_max_charge(text: str, _: Answers) -> object:
-    return None if text == NO_LIMIT else _validated(PackSettings, "max_charge_a", parse_number(text, "A"))
-
-
-def _parse_device_soc_std(text: str, _: Answers) -> object:
-    return None if text == NO_LIMIT else _validated(PackSettings, "device_soc_std", parse_number(text, "%") / 100.0)
 
 
 def _reports_soc(answers: Answers) -> bool:
@@ -303,12 +279,20 @@ QUESTIONS = (
         _suggest_series,
         hint="empty: the number that fits the measured voltage",
     ),
-    Question("parallel", "Cells in parallel", "number of cells in parallel", _parse_parallel, lambda _: "1"),
+    Question(
+        "parallel",
+        "Cells in parallel",
+        "number of cells in parallel",
+        lambda text, _: _validated(PackSettings, "parallel", _integer(text)),
+        lambda _: "1",
+    ),
     Question(
         "full_voltage_v",
         "Voltage of the pack at which its charger stops [V]",
         f"voltage of the pack at which its charger stops, which is 100 % [V]; {NO_LIMIT}: that of the cell file",
-        _parse_full_voltage,
+        lambda text, answers: (
+            None if text == NO_LIMIT else _parse_limit_v("full_voltage_v", text, answers, above_middle=True)
+        ),
         lambda answers: _suggest_limit_v(answers, 0),
         explanation="The SOC is 100 % at this voltage: see the charger's manual. If the charger does not reach it, 100 % is never reported.",
         hint="empty: usual for the chemistry",
@@ -317,7 +301,9 @@ QUESTIONS = (
         "cutoff_voltage_v",
         "Voltage of the pack at which its BMS ends a discharge [V]",
         f"voltage of the pack at which its BMS ends a discharge, which is 0 % [V]; {NO_LIMIT}: that of the cell file",
-        _parse_cutoff_voltage,
+        lambda text, answers: (
+            None if text == NO_LIMIT else _parse_limit_v("cutoff_voltage_v", text, answers, above_middle=False)
+        ),
         lambda answers: _suggest_limit_v(answers, 1),
         explanation="This is 0 %: see the settings of the BMS.",
         hint="empty: usual for the chemistry",
@@ -326,21 +312,25 @@ QUESTIONS = (
         "max_discharge_a",
         "Largest discharge current of the pack by its rating or its BMS [A]",
         f"largest discharge current of the pack [A]; {NO_LIMIT}: unknown",
-        _parse_max_discharge,
+        lambda text, _: (
+            None if text == NO_LIMIT else _validated(PackSettings, "max_discharge_a", parse_number(text, "A"))
+        ),
         lambda _: NO_LIMIT,
     ),
     Question(
         "max_charge_a",
         "Largest charge current of the pack by its rating or its BMS [A]",
         f"largest charge current of the pack [A]; {NO_LIMIT}: unknown",
-        _parse_max_charge,
+        lambda text, _: None if text == NO_LIMIT else _validated(PackSettings, "max_charge_a", parse_number(text, "A")),
         lambda _: NO_LIMIT,
     ),
     Question(
         "device_soc_std",
         "How far may the SOC of the device be wrong [%]",
         f"standard deviation of the SOC that the device reports, from which the estimate starts [%]; {NO_LIMIT}: it is not used",
-        _parse_device_soc_std,
+        lambda text, _: (
+            None if text == NO_LIMIT else _validated(PackSettings, "device_soc_std", parse_number(text, "%") / 100.0)
+        ),
         lambda answers: DEFAULT_DEVICE_SOC_STD if _reports_soc(answers) else NO_LIMIT,
         explanation="The estimate starts from this SOC, with the error that you give as its standard deviation.",
         is_asked=_reports_soc,

@@ -57,14 +57,14 @@ def open_device(
     return LineSource(producer, settings.sensor, period_s=settings.sensor.sample_period_s, tap=tap)
 
 
-def with_bms(device: DeviceSource, settings: Settings) -> DeviceSource | PairedSource:
+def pair_with_bms(device: DeviceSource, settings: Settings) -> DeviceSource | PairedSource:
     """Return the source of the pack: the device, with the BMS in ``[bms]`` if there is one.
 
     Raises:
         UserError: A setting cannot be used.
         ModuleNotFoundError: An optional package is missing.
     """
-    bms = settings.bms_only
+    bms = settings.bms_settings
     return device if bms is None else PairedSource(device, open_device(bms), bms.sensor.sample_period_s)
 
 
@@ -75,4 +75,4 @@ def open_source(settings: Settings) -> DeviceSource | PairedSource:
         UserError: A setting cannot be used.
         ModuleNotFoundError: An optional package is missing.
     """
-    return with_bms(open_device(settings), settings)
+    return pair_with_bms(open_device(settings), settings)

@@ -143,7 +143,7 @@ class LineSource:
         """Description of a fault of the device's clock; empty without one."""
         return self._decoder.clock_fault
 
-    current_zero: None = None
+    store_current_zero: None = None
     """Function that sets the zero of the current; None: lines have no such command."""
     relay: None = None
     """Function that switches a relay; None: no relay."""

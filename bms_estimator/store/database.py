@@ -61,7 +61,7 @@ class Database:
         retry_s: Delay after a failure before the disk is retried [s].
 
     Attributes:
-        reason: Reason why the database is unavailable; empty while it is available.
+        failure_reason: Reason why the database is unavailable; empty while it is available.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Database:
         disk_timeout_s: float = DISK_TIMEOUT_S,
         retry_s: float = RETRY_S,
     ) -> None:
-        self.path, self.reason = path, ""
+        self.path, self.failure_reason = path, ""
         self._disk_timeout_s, self._retry_s = disk_timeout_s, retry_s
         self._thread = DaemonThreadExecutor("database")
         self._hung_call: asyncio.Future[Any] | None = None
@@ -124,7 +124,7 @@ class Database:
         """
         now_s = asyncio.get_running_loop().time()
         if (self._hung_call and not self._hung_call.done()) or now_s - self._last_failure_s < self._retry_s:
-            raise StoreError(self.reason)
+            raise StoreError(self.failure_reason)
         running = self._thread.submit(self._file.run, work)
         waiter = asyncio.wrap_future(running)
         began_s = asyncio.get_running_loop().time()
@@ -140,15 +140,15 @@ class Database:
         except (sqlite3.Error, OSError) as error:
             self._last_failure_s = asyncio.get_running_loop().time()
             raise self._failure(str(error)) from error
-        if self.reason:
+        if self.failure_reason:
             log.info("database is back", file=str(self.path))
-            self.reason = ""
+            self.failure_reason = ""
         return result
 
     def _failure(self, reason: str) -> StoreError:
-        if not self.reason:
+        if not self.failure_reason:
             log.warning("database cannot be used: going on in memory", file=str(self.path), reason=reason)
-        self.reason = reason
+        self.failure_reason = reason
         return StoreError(reason)
 
 

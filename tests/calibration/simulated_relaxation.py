@@ -28,27 +28,12 @@ def relaxation(**options):
     return capture(schedule(**options), soc=1.0, **noise)
 
 
-def without_rests():
-    """Return two hours of a constant load."""
-    return capture(np.full(7200, LOAD_A), soc=1.0)
-
-
-def rests_too_short():
-    """Return a relaxation test with rests of 20 s."""
-    return relaxation(rest_s=20)
-
-
 def glitched(share, seed=5):
     """Return a relaxation test in which the fraction ``share`` of the voltages is 0 V, as with a loose wire."""
     samples = relaxation()
     is_glitch = np.random.default_rng(seed).random(samples.size) < share
     samples["voltage_v"][is_glitch] = 0.0
     return samples
-
-
-def mostly_zero():
-    """Return a relaxation test in which 70 % of the voltages are 0 V."""
-    return glitched(0.7)
 
 
 def wrong_sign():
@@ -58,23 +43,25 @@ def wrong_sign():
     return samples
 
 
-def too_few_rests():
-    """Return a relaxation test with five rests."""
-    return relaxation(rounds=4)
-
-
-def small_span():
-    """Return a relaxation test over 7 % of the charge."""
-    return relaxation(load_s=60, rounds=8)
-
-
 INVALID_CAPTURES = {
-    "no rests": (without_rests, 3.0, "no rests in 1.94 h: the current never falls below 1.500 A"),
-    "short rests": (rests_too_short, 3.0, "1 usable rests, at least 6 are needed; 19 others were too short"),
+    "no rests": (
+        lambda: capture(np.full(7200, LOAD_A), soc=1.0),
+        3.0,
+        "no rests in 1.94 h: the current never falls below 1.500 A",
+    ),
+    "short rests": (
+        lambda: relaxation(rest_s=20),
+        3.0,
+        "1 usable rests, at least 6 are needed; 19 others were too short",
+    ),
     "wrong sign": (wrong_sign, 3.0, "current has the wrong sign or the capture charges: 0.000 Ah out, 2.9"),
     "capacity": (relaxation, 2.0, "SOC runs from 1.000 to -0.4"),
-    "few rests": (too_few_rests, 3.0, "5 usable rests, at least 6 are needed"),
-    "span": (small_span, 3.0, "points span SOC 0.93 to 1.00 only"),
-    "0 V": (mostly_zero, 3.0, "of 24144 samples are glitches, the first at 2 s with 0.000 V where the median is 3.6"),
+    "few rests": (lambda: relaxation(rounds=4), 3.0, "5 usable rests, at least 6 are needed"),
+    "span": (lambda: relaxation(load_s=60, rounds=8), 3.0, "points span SOC 0.93 to 1.00 only"),
+    "0 V": (
+        lambda: glitched(0.7),
+        3.0,
+        "of 24144 samples are glitches, the first at 2 s with 0.000 V where the median is 3.6",
+    ),
 }
 """Invalid captures by fault: function that simulates the capture, capacity [Ah], and part of the error message."""

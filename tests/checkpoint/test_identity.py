@@ -19,14 +19,19 @@ from bms_estimator.settings.pack import Settings
 CHECKPOINT_FILE = Path(__file__).with_name("checkpoint_format_7.npz")
 """State after 30 min of a simulated ``chen_mora`` cell under current steps; SOC 0.3710."""
 WITH_IDENTIFIER = {"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}}
-COULOMB_COUNTING = {"sensor": {"current_sign": "charge_positive"}, "identifier": {"enabled": False}}
 
 
 @pytest.mark.parametrize(
     ("settings", "cell", "pack_id", "observer_id", "fleet_digest"),
     [
         (WITH_IDENTIFIER, load_model("chen_mora"), "5613cbc091ec7ec4", "77ac24e88a0d1f8b", 15431052729970494762),
-        (COULOMB_COUNTING, load_cell("leaf").pack(2, 3), "1f291d5895e57362", "06eca6aa573c6d46", 12826646859050909060),
+        (
+            {"sensor": {"current_sign": "charge_positive"}, "identifier": {"enabled": False}},
+            load_cell("leaf").pack(2, 3),
+            "1f291d5895e57362",
+            "06eca6aa573c6d46",
+            12826646859050909060,
+        ),
         ({}, load_model("pem_30w"), "c5d3c64ecb5da3be", "443c82b27a91fe8c", 7172455394262107276),
     ],
     ids=["chen_mora", "leaf", "pem_30w"],

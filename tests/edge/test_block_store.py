@@ -250,7 +250,7 @@ async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(ful
     async with open_store(full_disk / "s.sqlite") as store:
         for block in minute_blocks(3):
             store.put(block)
-        await until(lambda: store._database.reason)
+        await until(lambda: store._database.failure_reason)
         assert (store.unconfirmed, store.waiting) == (3, 3)
         (full_disk / "file").unlink()
         await asyncio.to_thread(subprocess.run, ["mount", "-o", "remount,size=10m", full_disk], check=True)

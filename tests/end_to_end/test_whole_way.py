@@ -6,7 +6,7 @@ import json
 import signal
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -174,7 +174,7 @@ async def test_a_replay_of_a_recording_gives_exactly_the_state_of_the_live_run(
         running = asyncio.create_task(board.run())
         async with Listener(broker, "bms/#") as listener, run_program(pack, "--record", str(capture)):
             for number, event in enumerate(line_events(board), start=1):
-                await listener.wait_json("bms/pack/health", has_frames(60 * number))
+                await listener.wait_json("bms/pack/health", lambda h, n=number: h["line"]["frames_received"] >= 60 * n)
                 event()
             await listener.wait_json("bms/pack/health", lambda h: h["line"]["resets"] and h["samples"]["samples"] > 450)
         running.cancel()
@@ -197,8 +197,3 @@ def line_events(board: VirtualBoard) -> list[Callable[[], None]]:
     """Return functions, each of which causes a fault of the line in three frames; the last resets the board."""
     faults = [lambda fault=fault: board.inject(fault, 3) for fault in BoardFault]  # type: ignore[misc]
     return [*faults, lambda: board.reset(ResetCause.BROWN_OUT)]
-
-
-def has_frames(frames: int) -> Callable[[Any], bool]:
-    """Return a condition for a health message: at least ``frames`` frames were received."""
-    return lambda health: health["line"]["frames_received"] >= frames

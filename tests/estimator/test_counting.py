@@ -36,14 +36,6 @@ MAX_OFFSET_STD_A = 0.006
 """Limit of the std of an offset after a day, in cells of 3 Ah [A]."""
 
 
-def nees_limit(cells: int) -> float:
-    """Return the limit of the mean of (error / std)^2 over this number of cells.
-
-    With a correct std, 1 of 1000 draws exceeds the limit.
-    """
-    return float(chi2.ppf(0.999, cells)) / cells
-
-
 def error_over_std(learned: IdentifiedValue, true_value: float) -> float:
     """Return the error of a learned value divided by its std."""
     return (learned.value - true_value) / learned.std
@@ -87,7 +79,8 @@ def test_a_capacity_wrong_by_20_percent_is_corrected_after_three_cycles(
     assert np.abs(errors).max() < MAX_CAPACITY_ERROR
     assert np.sqrt(np.mean(np.square(errors))) < MAX_RMS_CAPACITY_ERROR
     # Both runs of a seed have the same error of the OCV, so that they are one degree of freedom.
-    assert np.mean(np.square(errors_over_std)) < nees_limit(len(seeds))
+    # With a correct std, 1 of 1000 draws exceeds the limit.
+    assert np.mean(np.square(errors_over_std)) < chi2.ppf(0.999, len(seeds)) / len(seeds)
 
 
 def test_a_gain_error_of_the_current_sensor_is_learned_as_a_capacity() -> None:

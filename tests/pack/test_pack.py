@@ -1,7 +1,6 @@
 """A pack with all its stages: the same results for any division of the samples into blocks, to the last bit."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack.state import PackState
 from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.cell_curves import SOC_GRID
-from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_pack import SimulatedPack as SimulatedLoad
@@ -36,11 +34,6 @@ def recording() -> tuple[np.ndarray, np.ndarray]:
     return samples, np.round(history.cell_v, 3)
 
 
-def tilted_fit(*arguments: Any) -> PackFit:
-    """Return a fit whose OCV has another slope than the cell file's, on which the estimates of single cells depend."""
-    return replace(quick_fit(*arguments), curve_v=np.linspace(0.0, 0.05, SOC_GRID.size))
-
-
 def run_in_blocks(
     recording: tuple[np.ndarray, np.ndarray], size: int, *, has_forecasts: bool = True
 ) -> tuple[Pack, bytes, bytes]:
@@ -58,7 +51,9 @@ def run_in_blocks(
 def test_estimates_forecasts_and_cells_do_not_depend_on_the_division_into_blocks(
     recording: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(slow_fit_module, "fit", tilted_fit)
+    # the slope of the OCV, on which the estimates of single cells depend, is not that of the cell file
+    tilt_v = np.linspace(0.0, 0.05, SOC_GRID.size)
+    monkeypatch.setattr(slow_fit_module, "fit", lambda *arguments: replace(quick_fit(*arguments), curve_v=tilt_v))
     monkeypatch.setattr(slow_fit_module, "MIN_THROUGHPUT_SOC", 0.0)
     whole, trace, forecasts = run_in_blocks(recording, recording[0].size)
     assert whole.slow_fit

@@ -36,7 +36,6 @@ module_fixture = pytest_asyncio.fixture(loop_scope="module", scope="module")
 MINUS, DASH = "\N{MINUS SIGN}", "\N{EN DASH}"
 PACK_SECTION = 'cell = "lfp"\ncapacity_ah = 100\nseries = 4\ninitial_soc = 0.6'
 CELLS_V = (3.311, 3.325, 3.318, 3.322)
-CELLAR_TOPIC = "bms/cellar"
 STATE_VALUES = {  # as published in ``state``
     "soc": 0.4321,
     "soc_percent": 43.21,
@@ -144,7 +143,7 @@ async def programs(folder: Path, broker: Broker) -> AsyncIterator[RunningProgram
 
 async def publish(live: Listener, topic: str, payload: str | bytes, *, retain: bool = True) -> None:
     """Publish a message of the pack ``cellar``."""
-    await live.publish(f"{CELLAR_TOPIC}/{topic}", payload, qos=1, retain=retain)
+    await live.publish(f"bms/cellar/{topic}", payload, qos=1, retain=retain)
 
 
 async def publish_state(live: Listener, **values: Any) -> dict[str, Any]:
@@ -163,11 +162,6 @@ async def dashboard_of(browser: Browser, programs: RunningPrograms, pack: str, *
         yield page_tab
 
 
-def format_time(time: str) -> str:
-    """Format a time as a browser on this machine does."""
-    return datetime.fromisoformat(time).astimezone().strftime("%H:%M:%S")
-
-
 async def test_page_shows_the_published_values_with_units(browser: Browser, programs: RunningPrograms) -> None:
     async with dashboard_of(browser, programs, "cellar") as page_tab:
         await publish_state(programs.live, **STATE_VALUES)
@@ -178,6 +172,15 @@ async def test_page_shows_the_published_values_with_units(browser: Browser, prog
         assert await gain.inner_text() == "Observer, N(k)\n0.97"
         meter = page_tab.page.get_by_role("meter", name="State of charge")
         assert await meter.get_attribute("aria-valuenow") == "43"
+        assert (
+            await page_tab.page.evaluate(
+                """async () => {
+                (await import("./state.js")).drawState({}, { value: 0.967, std: 0.031, valid: false });
+                return document.querySelector("[data-q=capacity_note]").textContent;
+            }"""
+            )
+            == "so far 97 ± 6 %"
+        )
         cell = page_tab.page.get_by_role("img", name="cell 4: 3.269 V, lowest")
         assert await cell.is_visible()
         assert await page_tab.page.get_by_role("img", name="cell 3: not measured").count() == 1
@@ -207,6 +210,10 @@ async def test_the_forecast_is_shown_as_curves_and_with_its_band(browser: Browse
         for chart in ("Voltage, forecast: from 2.700 to 3.800 V", "State of charge, forecast: from 0.000 to 50.000 %"):
             await page_tab.page.get_by_role("img", name=chart).wait_for()
         await page_tab.page.get_by_role("img", name="Load still on, probability, forecast: from 0").wait_for()
+        assert ":" not in await page_tab.page.evaluate(  # two midnights within 36 h
+            """async () => (await import("./forecast.js")).charts.v.plot.axes[0]
+            .values({ scales: { x: { min: 0, max: 130000 } } }, [0, 86400]).join()"""
+        )
         assert page_tab.errors == []
 
 
@@ -324,7 +331,8 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
             assert await page_tab.text("celllow") == "3.311 V · cell 1"
             assert re.search(r"in series · nominal [\d.]+ V · ", await page_tab.page.inner_text("#what"))
             await page_tab.until(
-                "count => document.querySelectorAll('#params tr').length === count", count_parameters(parameters)
+                "count => document.querySelectorAll('#params tr').length === count",
+                sum(len(parameters[group]) for group in ("a", "elements", "state_of_health")),
             )
             assert await page_tab.text("capacity_health") == "not known yet"
             await page_tab.page.get_by_text("For experts").click()
@@ -346,10 +354,6 @@ def format_parameter(parameter: dict[str, Any]) -> str:
         return f"{parameter['value']:.4g}"
     decimals = 1 - math.floor(math.log10(parameter["std"]))
     return f"{parameter['value']:.{decimals}f}"
-
-
-def count_parameters(parameters: dict[str, Any]) -> int:
-    return sum(len(parameters[group]) for group in ("a", "elements", "state_of_health"))
 
 
 async def test_packs_spans_and_elements_are_selected_by_keyboard(browser: Browser, programs: RunningPrograms) -> None:
@@ -411,13 +415,21 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, programs: 
         text = await element.inner_text()
         assert "cell voltages are missing" in text
         assert "cannot be watched" in text
-        other = unwatched.model_copy(update={"name": "cell_over_voltage"})
-        await publish(programs.live, "alarm/cell_over_voltage", other.model_dump_json())
+        await publish(
+            programs.live,
+            "alarm/cell_over_voltage",
+            unwatched.model_copy(update={"name": "cell_over_voltage"}).model_dump_json(),
+        )
         rows = page_tab.page.locator(".alarm")
         await rows.get_by_text("cell under voltage, cell over voltage").wait_for()
         assert await rows.count() == 1
-        named = {"name": "sensor_fault", "text": "cell voltages are missing: cell_under_voltage cannot be raised"}
-        await publish(programs.live, "alarm/sensor_fault", alarm.model_copy(update=named).model_dump_json())
+        await publish(
+            programs.live,
+            "alarm/sensor_fault",
+            alarm.model_copy(
+                update={"name": "sensor_fault", "text": "cell voltages are missing: ..."}
+            ).model_dump_json(),
+        )
         await rows.get_by_text("sensor fault").wait_for()
         assert await rows.count() == 1
         for name in ("cell_under_voltage", "cell_over_voltage", "sensor_fault"):
@@ -541,7 +553,7 @@ async def test_page_is_stale_while_the_sensor_or_the_service_is_offline(
         )
         await publish(programs.live, "health", offline.model_dump_json())
         await publish(programs.live, "sensor/availability", b"offline")
-        await page_tab.until_status(f"stale since {format_time(state['time'])}")
+        await page_tab.until_status(f"stale since {datetime.fromisoformat(state['time']).astimezone():%H:%M:%S}")
         assert "the board is silent" in await page_tab.page.inner_text("#why")
         await publish(programs.live, "sensor/availability", b"online")
         await publish(programs.live, "health", CELL_SNAPSHOT.health.model_dump_json())

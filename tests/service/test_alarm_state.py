@@ -178,13 +178,9 @@ def folder(latched: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(latched, tmp_path / "state"))
 
 
-def edit_cell(**values: Any) -> CellModel:
-    return CELL.model_copy(update={"cell": CELL.cell.model_copy(update=values)})
-
-
 EDITS: dict[str, tuple[Settings, CellModel]] = {
     "none": (SETTINGS, CELL),
-    "capacity": (SETTINGS, edit_cell(capacity_ah=0.5)),
+    "capacity": (SETTINGS, CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"capacity_ah": 0.5})})),
     "series": (SETTINGS, CELL.pack(2, 1)),
     "sign": (edit_settings("sensor", current_sign="charge_positive"), CELL),
     "curve": (SETTINGS, CELL.model_copy(update={"ocv": CELL.ocv.model_copy(update={"constant_v": 3.7})})),
@@ -390,10 +386,6 @@ async def test_an_upgrade_beside_a_newer_damaged_checkpoint_takes_the_safe_side(
     assert restarted.restarts == 4
 
 
-def remove_run_file(folder: Path) -> None:
-    (folder / "pack.run").unlink()
-
-
 def copy_from_another_pack(folder: Path) -> None:
     another = StateFiles(folder, edit_settings("pack", name="another"), CELL).run_file
     another.save(another.load().counters)
@@ -416,7 +408,13 @@ def return_from_former_version(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "edit", [copy_from_another_pack, remove_run_file, interrupt_quarantine, return_from_former_version]
+    "edit",
+    [
+        copy_from_another_pack,
+        lambda folder: (folder / "pack.run").unlink(),
+        interrupt_quarantine,
+        return_from_former_version,
+    ],
 )
 async def test_a_checkpoint_of_a_former_version_does_not_hide_lost_alarms(
     folder: Path, edit: Callable[[Path], None]

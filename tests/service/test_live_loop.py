@@ -349,7 +349,7 @@ AT_REST = [(0.03, 3.8)] * (round(REST_S) + 2)
 
 async def test_current_zero_is_accepted_at_rest() -> None:
     zero = ZeroRecorder()
-    async with run_loop(current_zero=zero, clock=zero.clock) as run:
+    async with run_loop(store_current_zero=zero, clock=zero.clock) as run:
         await zero.feed(run, AT_REST)
         assert await run.ask("current_zero") == {}
     assert zero.calls == 1
@@ -367,7 +367,7 @@ async def test_current_zero_is_accepted_at_rest() -> None:
 )
 async def test_current_zero_is_rejected_without_a_sufficient_rest(rows: list[tuple[float, float]], reason: str) -> None:
     zero = ZeroRecorder()
-    async with run_loop(current_zero=zero, clock=zero.clock) as run:
+    async with run_loop(store_current_zero=zero, clock=zero.clock) as run:
         await zero.feed(run, rows)
         with pytest.raises(UserError, match=reason):
             await run.ask("current_zero")
@@ -376,7 +376,7 @@ async def test_current_zero_is_rejected_without_a_sufficient_rest(rows: list[tup
 
 async def test_current_zero_is_rejected_after_a_silence_of_the_board_that_follows_a_rest() -> None:
     zero = ZeroRecorder()
-    async with run_loop(current_zero=zero, clock=zero.clock) as run:
+    async with run_loop(store_current_zero=zero, clock=zero.clock) as run:
         await zero.feed(run, AT_REST)
         zero.now_s += REST_S
         await run.sink.until(lambda s: not s.health.sensor_online, skip=len(run.sink.snapshots))

@@ -24,7 +24,6 @@ from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 
 STATE_TOPIC, HEALTH_TOPIC, AVAILABILITY_TOPIC = "bms/pack/state", "bms/pack/health", "bms/pack/sensor/availability"
-ONLINE_MESSAGE = AVAILABILITY_TOPIC, b"online"
 
 
 def esphome_settings(broker: Broker, **source: object) -> Settings:
@@ -111,7 +110,11 @@ async def check_live_and_retained(broker: Broker, listener: Listener) -> None:
 
 async def check_silence(listener: Listener) -> None:
     """Check that the sensor goes offline after the last message."""
-    online = max(i for i, (topic, payload, _) in enumerate(listener.messages) if (topic, payload) == ONLINE_MESSAGE)
+    online = max(
+        i
+        for i, (topic, payload, _) in enumerate(listener.messages)
+        if (topic, payload) == (AVAILABILITY_TOPIC, b"online")
+    )
     await listener.wait(AVAILABILITY_TOPIC, lambda payload: payload == b"offline", skip=online)
     health = await listener.wait_json(HEALTH_TOPIC, lambda h: not h["sensor_online"], skip=online)
     assert health["sensor_message"]

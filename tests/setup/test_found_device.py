@@ -40,7 +40,7 @@ def test_the_settings_of_a_pair_have_both_devices_and_the_login_of_the_broker() 
     answers = Answers(with_pairs([SHUNT, NODE])[2], None, "house", "lfp", 100.0, 16, 1)
     settings = parse_toml(settings_file(Settings, answers.tables), Settings, "pack.toml")
     assert (settings.sensor.protocol, settings.source) == ("vedirect", None)
-    bms = settings.bms_only
+    bms = settings.bms_settings
     assert bms
     assert bms.source
     assert (bms.source.kind, bms.sensor.protocol, bms.bms) == ("mqtt", "text", None)

@@ -141,10 +141,10 @@ async def test_full_disk_is_logged_once_and_used_again_once_it_has_space(full_di
             for _ in range(3):
                 with pytest.raises(StoreError):
                     await database.call(insert_message(1))
-            assert database.reason
+            assert database.failure_reason
             os.system(f"mount -o remount,size=4m {full_disk}")  # noqa: ASYNC221
             await database.call(insert_message(1))
-            assert (database.reason, await database.call(message_numbers)) == ("", [1])
+            assert (database.failure_reason, await database.call(message_numbers)) == ("", [1])
     assert [line["log_level"] for line in logs] == ["warning", "info"]
 
 
@@ -182,7 +182,7 @@ async def test_hung_disk_does_not_block_callers_and_is_used_again_once_it_answer
             await database.call(message_numbers)  # fails at once, without a disk access
         may_return.set()
         async with asyncio.timeout(LONG_S):
-            while database.reason:
+            while database.failure_reason:
                 try:
                     await database.call(message_numbers)
                 except StoreError:

@@ -183,7 +183,7 @@ async def test_rows_wait_in_memory_while_the_disk_fails(path):
         database._file._quarantine_non_regular = leave_in_place  # type: ignore[method-assign]
         history.publish(snapshot_at(0.0))
         history.publish(snapshot_at(60.0))
-        await until(lambda: database.reason)
+        await until(lambda: database.failure_reason)
         (path / "file").unlink()
         path.rmdir()
     assert [row.time_s for row in read_rows(path)] == [BEGIN_S, BEGIN_S + 60]
@@ -255,7 +255,7 @@ async def test_failed_vacuum_does_not_undo_a_transaction(path, monkeypatch):
     async with Database(path, retry_s=0.0) as database:
         # ``and None``: a cursor must not leave the thread of the database
         await database.call(lambda connection: connection.execute("DELETE FROM minute") and None)
-        assert not database.reason
+        assert not database.failure_reason
 
 
 class BrokenDatabase(Database):

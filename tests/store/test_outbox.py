@@ -248,7 +248,7 @@ async def test_damaged_row_is_skipped_and_counted(path, column, value):
         received: list[int] = []
         while len(received) < 3:
             received += await take_numbers(outbox, 9)
-        assert (received, outbox.dropped, database.reason) == ([0, 2, 3], 1, "")
+        assert (received, outbox.dropped, database.failure_reason) == ([0, 2, 3], 1, "")
     assert numbers_on_disk(path) == [0, 2, 3]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.kernels.alarms.quantities import update_quantities
-from bms_estimator.kernels.alarms.records import ALARMS, LIMITS, LOG, NAMES, PART, SETTINGS, TEMPERATURE
+from bms_estimator.kernels.alarms.records import ALARMS, EVALUATION_IO, LIMITS, LOG, NAMES, SETTINGS, TEMPERATURE
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.telemetry.alarms.saved_state import decode
 
@@ -21,7 +21,12 @@ def change_times_s(present: Sequence[bool], steps_s: float, lost_s: float = 10.0
         lost_s: Time without values after which the temperature is lost [s].
         lost: True if the temperature is lost before the first sample.
     """
-    alarms, limits, part, log = np.zeros(1, ALARMS), np.zeros(len(NAMES), LIMITS), np.zeros(1, PART), np.zeros(9, LOG)
+    alarms, limits, part, log = (
+        np.zeros(1, ALARMS),
+        np.zeros(len(NAMES), LIMITS),
+        np.zeros(1, EVALUATION_IO),
+        np.zeros(9, LOG),
+    )
     limits["monitored"][0], limits["needs"][0] = 1, 1 << TEMPERATURE
     settings, samples, scratch = np.zeros(1, SETTINGS), np.zeros(1, SAMPLE), np.zeros((6, 1))
     settings["lost_s"], alarms["states"]["unwatched"][0, 0] = lost_s, lost

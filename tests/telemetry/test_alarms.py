@@ -13,7 +13,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.alarms.evaluate import update_alarm
 from bms_estimator.kernels.alarms.records import ALARMS as STATES
-from bms_estimator.kernels.alarms.records import LIMITS, LOG, PART, RAISED, SETTINGS
+from bms_estimator.kernels.alarms.records import EVALUATION_IO, LIMITS, LOG, RAISED, SETTINGS
 from bms_estimator.kernels.alarms.states import acknowledge
 from bms_estimator.kernels.cells.records import ReadingFault
 from bms_estimator.kernels.trace import TRACE
@@ -264,7 +264,7 @@ class KernelAlarm:
     """
 
     def __init__(self, sign: float = 1.0, **changes: float) -> None:
-        self._alarms, self._part, self._log = np.zeros(1, STATES), np.zeros(1, PART), np.zeros(9, LOG)
+        self._alarms, self._part, self._log = np.zeros(1, STATES), np.zeros(1, EVALUATION_IO), np.zeros(9, LOG)
         self._limits, self._sign, self._time_s = np.zeros(1, LIMITS), sign, 0.0
         rule = {"limit": 10.0, "clear": 8.0, "delay_s": 2.0, "clear_delay_s": 3.0, "latch": 0} | changes
         for name, value in {"monitored": 1, "sign": sign, **rule}.items():

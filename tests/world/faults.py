@@ -144,14 +144,6 @@ def _jump_s(fault: Fault) -> float:
     return math.copysign(MIN_JUMP_S * (MAX_JUMP_S / MIN_JUMP_S) ** size, fault.severity - 0.5)
 
 
-def _step_board_clock(world: "World", fault: Fault) -> None:
-    world.board.step_clock(_jump_s(fault))
-
-
-def _send_one_wrong_stamp(world: "World", fault: Fault) -> None:
-    world.board.stamp_errors_us.append(round(_jump_s(fault) * 1e6))
-
-
 def _randomize_stamps(world: "World", fault: Fault) -> None:
     board, dice = world.board, world.dice["faults"]
     samples = math.ceil(min(fault.duration_s, MAX_RANDOM_S) / board.period_s)
@@ -164,14 +156,6 @@ def _stop_broker(world: "World", fault: Fault) -> None:
         world.will_certain &= world.process is not None or not world.broker.connections
         world.broker.stop(loses_retained=fault.severity < 0.3)
         world.timeline.after(fault.duration_s, world.broker.start)
-
-
-def _cut_connections(world: "World", fault: Fault) -> None:
-    world.broker.drop()
-
-
-def _half_open_connections(world: "World", fault: Fault) -> None:
-    world.broker.half_open()
 
 
 def _block_broker(world: "World", fault: Fault) -> None:
@@ -264,10 +248,6 @@ def _forge_availability(world: "World", fault: Fault) -> None:
     world.will_certain &= world.process is not None  # without a process, the forged message remains
 
 
-def _send_birth_message(world: "World", fault: Fault) -> None:
-    world.broker.publish_as_other("homeassistant/status", b"online")
-
-
 KINDS: dict[str, Callable[["World", Fault], None]] = {
     "bytes flipped": _with_noise(lambda severity: Noise(flip=10.0 ** (-4.0 + 3.0 * severity))),
     "bytes lost": _with_noise(lambda severity: Noise(lose=10.0 ** (-4.0 + 3.0 * severity))),
@@ -277,8 +257,8 @@ KINDS: dict[str, Callable[["World", Fault], None]] = {
     "board reset": _reset_board,
     "boards swapped": _swap_boards,
     "broker down": _stop_broker,
-    "connections cut": _cut_connections,
-    "connections half open": _half_open_connections,
+    "connections cut": lambda world, _: world.broker.drop(),
+    "connections half open": lambda world, _: world.broker.half_open(),
     "broker unreachable": _block_broker,
     "broker frozen": _freeze_broker,
     "wall clock stepped": _step_wall_clock,
@@ -293,9 +273,9 @@ KINDS: dict[str, Callable[["World", Fault], None]] = {
     "process frozen": _freeze_process,
     "hostile requests": _send_hostile_requests,
     "availability forged": _forge_availability,
-    "birth message": _send_birth_message,
-    "board's clock stepped": _step_board_clock,
-    "one stamp wrong": _send_one_wrong_stamp,
+    "birth message": lambda world, _: world.broker.publish_as_other("homeassistant/status", b"online"),
+    "board's clock stepped": lambda world, fault: world.board.step_clock(_jump_s(fault)),
+    "one stamp wrong": lambda world, fault: world.board.stamp_errors_us.append(round(_jump_s(fault) * 1e6)),
     "board's clock at random": _randomize_stamps,
 }
 CLOCK_FAULTS = ("board's clock stepped", "one stamp wrong", "board's clock at random")

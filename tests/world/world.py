@@ -476,11 +476,10 @@ class World:
             self.note(f"broker: {packet.topic} {packet.payload[:60]!r}")
         if connection is not None and packet.payload[:1] == b"{" and not invariants.is_json(packet.payload):
             self.fail(f"{packet.topic} is no strict JSON: {packet.payload[:200]!r}")
-        if packet.topic == f"{ROOT}/state" and (violation := self._check_state(packet, connection)):
+        if packet.topic == f"{ROOT}/state" and (
+            violation := self.published.check_received(packet, connection, in_order=not self._disk_fails)
+        ):
             self.fail(violation)
-
-    def _check_state(self, packet: Packet, connection: Connection | None) -> str:
-        return self.published.check_received(packet, connection, in_order=not self._disk_fails)
 
     @property
     def _disk_fails(self) -> bool:

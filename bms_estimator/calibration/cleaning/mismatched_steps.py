@@ -19,8 +19,8 @@ MAX_VOLTAGE_CHANGE = 0.05
 """Maximum change of the voltage at the step of the current, as a fraction of the response one sample earlier or later. A larger
 change is the ohmic drop, so that voltage and current belong together."""
 MIN_RATE_RATIO = 3.0
-"""Minimum ratio of the response's rate of change to that of the voltage in the interval beyond it: after a late response, or
-before an early one. A steady fall of the voltage, as near empty, is not a delayed response."""
+"""Minimum ratio of the response's rate of change to the rate of change in the next interval, or in the previous interval for an
+early voltage. A steady fall of the voltage, as near empty, is not a delayed response."""
 MIN_RESPONSE = 5.0
 """Minimum response of the voltage, in multiples of its median change between two samples, so that noise is not a response."""
 
@@ -65,7 +65,7 @@ def _old_voltages(samples: SampleBlock) -> NDArray[np.bool_]:
     if samples.size < MIN_SAMPLES:
         return np.zeros(samples.size, dtype=np.bool_)
     time_s, current_a, voltage_v = samples["time_s"], samples["current_a"], samples["voltage_v"]
-    change_a, change_v, step_s = np.diff(current_a), np.diff(voltage_v), np.abs(np.diff(time_s))
+    change_a, change_v, interval_s = np.diff(current_a), np.diff(voltage_v), np.abs(np.diff(time_s))
     step_a = change_a[:-2]
     response_v = -np.sign(step_a) * change_v[1:-1]  # a discharge is positive and lowers the voltage
     is_old = (
@@ -73,6 +73,6 @@ def _old_voltages(samples: SampleBlock) -> NDArray[np.bool_]:
         & (np.abs(change_a[1:-1]) <= MAX_CURRENT_CHANGE * np.abs(step_a))
         & (np.abs(change_v[:-2]) <= MAX_VOLTAGE_CHANGE * response_v)
         & (response_v > MIN_RESPONSE * np.median(np.abs(change_v)))
-        & (response_v * step_s[2:] > MIN_RATE_RATIO * np.abs(change_v[2:]) * step_s[1:-1])
+        & (response_v * interval_s[2:] > MIN_RATE_RATIO * np.abs(change_v[2:]) * interval_s[1:-1])
     )
     return np.concatenate([[False], is_old, [False, False]])

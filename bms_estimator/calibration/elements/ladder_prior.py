@@ -39,7 +39,8 @@ def ladder_prior(cell: CellModel, scale_ohm: float, *, refine_ocv: bool, spans_t
         spans_temperature: True if the captures give activation energies and dE/dT.
     """
     series, given = cell.cell.series_count, cell.ladder
-    per_kelvin_std_v = PER_KELVIN_STD_V if _per_kelvin(cell) is None else MEASURED_PER_KELVIN_STD_V
+    measured = isinstance(cell.ocv, TableOcv) and cell.ocv.per_kelvin_v is not None
+    per_kelvin_std_v = MEASURED_PER_KELVIN_STD_V if measured else PER_KELVIN_STD_V
     return Prior(
         ocv_error_v=_curve_error(cell) if refine_ocv else np.full(EVEN_SOC.size, FIXED_OCV_STD_V),
         per_kelvin_std_v=(per_kelvin_std_v if spans_temperature and refine_ocv else FIXED_PER_KELVIN_STD_V) * series,
@@ -99,7 +100,3 @@ def _curve_error(cell: CellModel) -> Floats:
     hysteresis_v = RESTED_FRACTION_STD * np.interp(EVEN_SOC, cell.ocv.soc, cell.ocv.hysteresis_v)
     square_v2: Floats = np.maximum(error_v**2 - hysteresis_v**2, (PAIR_V * cell.cell.series_count) ** 2)
     return np.sqrt(square_v2)
-
-
-def _per_kelvin(cell: CellModel) -> tuple[float, ...] | None:
-    return cell.ocv.per_kelvin_v if isinstance(cell.ocv, TableOcv) else None

@@ -19,7 +19,6 @@ from rich.table import Table
 from rich.text import Text
 
 from bms_estimator.calibration.automatic.calibrate import Calibration, calibrate
-from bms_estimator.calibration.automatic.recognition import RecognizedCapture
 from bms_estimator.calibration.guided_test.plan import LONG, SHORT
 from bms_estimator.cli.cell.calibrate_live import RelayOptions, run_guided_test
 from bms_estimator.cli.cell.calibration_input import given_cell, load_captures_and_curves, split_inputs
@@ -69,7 +68,12 @@ def result_text(out: Path, calibration: Calibration) -> Group:
     table = Table("capture", "recognized as", "°C", "used for", title=f"{out}: written", box=box.SIMPLE_HEAD)
     table.title_justify = "left"
     for each in calibration.captures:
-        table.add_row(each.capture.name.split(".")[0], each.kind, _temperature_text(each), each.determined)
+        table.add_row(
+            each.capture.name.split(".")[0],
+            each.kind,
+            f"{each.temperature_c:.0f}" if math.isfinite(each.temperature_c) else "no sensor",
+            each.determined,
+        )
     lines = [f"capacity {calibration.model.cell.cell.capacity_ah:.4g} Ah: {calibration.capacity.origin}"]
     lines += [line.rstrip(".") for line in _origin_lines(calibration)]
     use = f'To use it, write cell = "{out}" in [pack] of the settings, without capacity_ah.'
@@ -118,10 +122,6 @@ def _origin_lines(calibration: Calibration) -> list[str]:
     return [f"OCV: {ocv}.", f"Resistances: from the generic {generic}, because {model.reason}."]
 
 
-def _temperature_text(each: RecognizedCapture) -> str:
-    return f"{each.temperature_c:.0f}" if math.isfinite(each.temperature_c) else "no sensor"
-
-
 class PlanName(StrEnum):
     """Guided tests."""
 
@@ -140,8 +140,9 @@ def calibrate_command(
     inputs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="[PACK.toml] CAPTURE...",
-            help=f"settings file of the pack; captures of the pack, each a {CAPTURE_FORMATS}; or OCV curves (CSV)",
+            metavar="FILE",
+            help=f"captures, each {CAPTURE_FORMATS}; OCV curves (CSV) are also accepted. The first FILE may be the settings file of the "
+            "measured pack, PACK.toml",
             show_default=False,
         ),
     ],
@@ -163,8 +164,8 @@ def calibrate_command(
         float | None,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="SOC 0..1 at the start of the captures that start at the highest voltage; default: 1 if their first rest shows "
-            "a full cell, otherwise from the voltage of that rest",
+            help="initial SOC, 0..1, of the captures that start at the highest voltage; default: 1 if their first rest shows a full "
+            "cell, otherwise read from the voltage of this rest",
             show_default=False,
         ),
     ] = None,

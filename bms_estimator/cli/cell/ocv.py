@@ -48,7 +48,7 @@ class SourceResult:
     points: int
     temperature_c: float | None
     off_mv: float | None
-    """RMS difference of the whole source from the curve; None for (2.10) of the thesis."""
+    """RMS difference of the whole source from the curve; None for the function of Chen and Rincón-Mora."""
     hysteresis_mv: float | None
     """Mean hysteresis over SOC."""
     notes: list[str]
@@ -65,7 +65,7 @@ class OcvResult:
     generic: str
     """Most similar generic cell. Its resistances are scaled to the resistances of the captures."""
     usual_hysteresis: bool
-    """True if the hysteresis of the generic cell is used, because no source determines it."""
+    """True if the hysteresis is the typical one, that of the generic cell, because no source determines it."""
     series_count: int
     points: int
     soc: list[float]
@@ -78,9 +78,10 @@ class OcvResult:
     rms_inside_mv: float
     """RMS of points minus curve at SOC 0.05 to 0.95, away from the steep ends."""
     error_mv: list[float]
-    """Standard deviation of the table at SOC 0, 0.1 ... 1; empty for (2.10) of the thesis."""
+    """Standard deviation of the table at SOC 0, 0.1 ... 1; empty for the function of Chen and Rincón-Mora."""
     parameters: dict[str, dict[str, float | None]]
-    """Values and standard deviations (None at a bound) of a16..a21, the parameters of (2.10); empty for a table."""
+    """Values and standard deviations (None at a bound) of a16..a21, the parameters of the function of Chen and Rincón-Mora; empty for a
+    table."""
     sources: list[SourceResult]
     captures: dict[str, dict[str, float]]
     """Numbers of rests and glitches and the final SOC, by capture with rests."""
@@ -93,7 +94,7 @@ def ocv(
     captures: Annotated[
         list[Path],
         typer.Argument(
-            help=f"captures with rests or slow discharges and charges, each a {CAPTURE_FORMATS}; or OCV curves (CSV)",
+            help=f"captures with rests or slow discharges and charges, each {CAPTURE_FORMATS}; or OCV curves (CSV)",
             show_default=False,
         ),
     ],
@@ -116,8 +117,8 @@ def ocv(
         float | None,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="SOC 0..1 at the start of the captures that start at the highest voltage; the SOC of other captures is read "
-            "from the OCV curve; default: 1, if that is the voltage of a full cell",
+            help="initial SOC, 0..1, of the captures that start at the highest voltage; the SOC of other captures is read "
+            "from the OCV curve; default: 1 if the highest voltage is that of a full cell",
             show_default=False,
         ),
     ] = None,
@@ -214,12 +215,12 @@ def _remarks(result: OcvResult) -> list[str]:
     """Return the comments at the beginning of the cell file."""
     generic = f"the generic {result.generic}"
     hysteresis = [f"Hysteresis: that of {generic}, because no source determines it."] if result.usual_hysteresis else []
-    elements = f"values from the rests of one capture, with the dependence on SOC and temperature of {generic}"
+    elements = f"estimated from the rests of one capture; their dependence on SOC and temperature is that of {generic}"
     return [
         f"OCV: {', '.join(f'{source.kind} of {source.name}' for source in result.sources)};",
         f"the {result.form} form differs from the points by {result.rms_mv:.2f} mV RMS, at most {result.max_mv:.2f} mV.",
         *hysteresis,
-        f"Elements: {elements if result.captures else f'those of {generic}'}; initial values for identify.",
+        f"Circuit elements: {elements if result.captures else f'those of {generic}'}. identify starts from them.",
     ]
 
 

@@ -21,7 +21,7 @@ from bms_estimator.process.state_folder import state_folder
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.pack import Settings, load_settings
-from bms_estimator.sources.factory import open_device, with_bms
+from bms_estimator.sources.factory import open_device, pair_with_bms
 from bms_estimator.sources.line_source import LineSource
 from bms_estimator.sources.serial.known_board_file import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
@@ -57,7 +57,7 @@ async def serve_edge(
     notifier = notifier or SystemdNotifier([name], activity="sending samples of")
     set_level(name, settings.log.level)
     device = open_device(settings, board_file=KnownBoardFile(folder, name))
-    source = with_bms(device, settings)
+    source = pair_with_bms(device, settings)
     with instance_lock(folder, name):
         async with BlockSender(settings.edge, name, folder) as sender, source:
             notifier.ready(name)

@@ -50,7 +50,8 @@ def install_command(
     """Install the service, or upgrade it: user, settings, systemd units and udev rule. Requires root.
 
     An upgrade keeps settings and state. A program in a home folder is copied to /opt/bms-estimator, because services
-    have no access to home folders. To upgrade the copy, run `install` of the program in the home folder again.
+    have no access to home folders. To upgrade the copy, run the `install` command again from the
+    program in the home folder.
     """
     machine = _machine(root, "install", [str(pack.resolve())] if pack else [])
     files = _check(pack) if pack else None

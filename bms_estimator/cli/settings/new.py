@@ -21,7 +21,6 @@ from bms_estimator.cli.settings.prompts import Prompts
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.process.log_setup import configure_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack_file import require_new
@@ -139,7 +138,11 @@ def new(
         if estimate and measured:
             compile_ahead()
             load_kernels()
-            asyncio.run(run_estimator(pack.settings, pack.cell, _print_estimate, seconds=ESTIMATE_S))
+            asyncio.run(
+                run_estimator(
+                    pack.settings, pack.cell, lambda estimate: typer.echo(estimate_text(estimate)), seconds=ESTIMATE_S
+                )
+            )
             if note := load_note(measured.current_a, pack.cell.cell.capacity_ah):
                 typer.echo(note)
         _offer_install(prompts, file, install)
@@ -248,10 +251,6 @@ def _measure(device: FoundDevice) -> Measurement | None:
         return None
     typer.echo(f"measured: {measured}")
     return measured
-
-
-def _print_estimate(estimate: Estimate) -> None:
-    typer.echo(estimate_text(estimate))
 
 
 def _ask(prompts: Prompts, question: Question, given: str | None, answers: Answers) -> Answers:

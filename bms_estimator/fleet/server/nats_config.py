@@ -19,7 +19,8 @@ MONITOR_PORT = 8222
 CLUSTER_PORT = 6222
 """Default TCP port for the other nodes of a cluster."""
 MAX_PAYLOAD_BYTES = 2 << 20
-"""Maximum size of a message [bytes]. A block of 60 samples has 700 bytes, and the longest history of a pack with its fit 0.9 MB."""
+"""Maximum size of a message [bytes]. A block of 60 samples has 700 bytes. The longest message, the history of a
+pack with its fit, has 0.9 MB."""
 MAX_CONNECTIONS = 200_000
 """Maximum number of connections of a node. If two of three nodes are down, all edges connect to the third node. The
 server's default is 65,536."""
@@ -79,10 +80,11 @@ class Node:
         cluster: Cluster settings; None: a single node.
         tls: TLS files for all ports except the monitor's; None: without TLS.
         accounts: Accounts of the tenants; None: without authentication, as a single tenant.
-        partitions: Number of partitions of the stream ``RAW``.
+        partitions: Number of partitions of the stream ``RAW``, for its creation. The configuration file does not contain it.
         disk_bytes: Maximum size of the streams [bytes]; None: the server's default, three quarters of the free space.
         memory_bytes: Maximum size of streams in memory [bytes]; None: the server's default.
-        sync_s: Interval between two fsyncs [s]; None: each message is synced before it is acknowledged.
+        sync_s: Interval between two fsyncs [s]. A power failure loses the messages since the last one. None: each message is
+            synced before it is acknowledged.
     """
 
     name: str

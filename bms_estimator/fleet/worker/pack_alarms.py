@@ -74,7 +74,7 @@ class PackAlarms:
             trace: Their estimates.
             wall_offset_s: Wall clock of the edge minus the samples' clock [s].
         """
-        part, slow_fit = self._evaluation.part[0], pack_type.pack.slow_fit
+        part, slow_fit = self._evaluation.io[0], pack_type.pack.slow_fit
         part["wall_offset_s"], part["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
         part["cells_at_s"], part["short_a"], part["reading_v"] = self._cell_values(pack_type)
         self._has_events |= self._evaluation.run(

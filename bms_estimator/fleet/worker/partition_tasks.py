@@ -1,4 +1,4 @@
-"""Tasks of one partition: process deferred messages (``deferred``), and send table changes to the stream."""
+"""Tasks of one partition: process deferred messages (``deferred``), and send changes of the table of packs to the stream."""
 
 import asyncio
 from collections.abc import Callable, Iterable
@@ -14,7 +14,7 @@ from bms_estimator.fleet.worker.block_result import ResultPublisher
 from bms_estimator.fleet.worker.block_runner import BlockRunner
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.fleet.worker.pinned_consumer import trusted_data
+from bms_estimator.fleet.worker.pinned_consumer import discard_forged_data
 
 
 class DeferredReader:
@@ -57,7 +57,7 @@ class DeferredReader:
             await self._wake_up.wait()
 
     def _is_due(self, pack: str) -> bool:
-        """Return True if a deferred pack is known and within its budget, or if no other pack needs the processor."""
+        """Return True if a deferred pack is known, and is within its budget or no other pack needs the processor."""
         partition = self._owned_partition()
         is_known = partition is not None and partition.in_force.is_known(pack)
         return is_known and not (self._runner.budget.is_exhausted(pack) and self._is_busy())
@@ -71,7 +71,7 @@ class DeferredReader:
             # the stream has dropped the messages; the reply to the edge's next block requests them again
             partition.deferred.advance(pack, span.last)
             return
-        data, sequence = trusted_data(message.subject or "", message.data or b""), message.seq or 0
+        data, sequence = discard_forged_data(message.subject or "", message.data or b""), message.seq or 0
         if sequence > span.last:  # the stream has dropped the deferred messages
             partition.deferred.advance(pack, span.last)
             return
@@ -83,7 +83,9 @@ class DeferredReader:
 
 
 class TableChangeSender:
-    """Task that sends the rows of the table that differ from the ones in force.
+    """Task that sends changed rows of the table of packs to the stream.
+
+    A row has changed if it differs from the row with which the partition processes its blocks (``table_in_force``).
 
     Args:
         nc: Connection to the tenant's NATS account.

@@ -29,7 +29,7 @@ def is_block(data: bytes) -> bool:
     return not (is_change(data) or is_fit(data))
 
 
-def trusted_data(subject: str, data: bytes) -> bytes:
+def discard_forged_data(subject: str, data: bytes) -> bytes:
     """Return the data of a stored message, or empty data if an edge has sent anything else in place of a block.
 
     Only workers send changes of the table, and only ``fleet fit`` sends fits. Empty data are rejected as a damaged block.
@@ -82,7 +82,7 @@ class RawMessages:
         async with aclosing(read_messages(self._nc, subjects.RAW_STREAM, self._subject, first, last)) as messages:
             async for message in messages:
                 pack = message.subject.rpartition(".")[2]
-                yield pack, message._replace(data=trusted_data(message.subject, message.data))
+                yield pack, message._replace(data=discard_forged_data(message.subject, message.data))
 
 
 RENEW_S = PIN_S / 4.0
@@ -219,7 +219,7 @@ class PinnedConsumer:
         follows = position.consumer_sequence == self._last_consumer_sequence + 1
         self._last_consumer_sequence = position.consumer_sequence
         pack = message.subject.rpartition(".")[2]
-        data = trusted_data(message.subject, message.data)
+        data = discard_forged_data(message.subject, message.data)
         self.waiting.append(
             DeliveredMessage(pack, data, position.stream_sequence, position.received_s, self._pin_count, follows)
         )

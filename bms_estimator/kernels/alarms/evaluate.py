@@ -3,7 +3,7 @@
 An alarm is raised after its delay, ends after its clear delay and, if it latches, after an acknowledgement. It is not watched
 while a quantity that it needs is lost.
 
-``a`` is a record of ALARMS, ``p`` of SETTINGS, ``b`` of PART, ``e`` of ESTIMATOR_STATE.
+``a`` is a record of ALARMS, ``p`` of SETTINGS, ``b`` of EVALUATION_IO, ``e`` of ESTIMATOR_STATE.
 """
 
 import math
@@ -56,7 +56,7 @@ def evaluate(
     alarms: Records,
     limits: Records,
     settings: Records,
-    part: Records,
+    io: Records,
     estimator: Records,
     samples: Records,
     cells_v: Floats,
@@ -71,7 +71,7 @@ def evaluate(
         alarms: Shape (1,), dtype ALARMS; updated in place.
         limits: Definitions of the alarms, dtype LIMITS.
         settings: Shape (1,), dtype SETTINGS.
-        part: Shape (1,), dtype PART; its results are updated.
+        io: Shape (1,), dtype EVALUATION_IO; its results are updated.
         estimator: State of the estimator after the samples, shape (1,), dtype ESTIMATOR_STATE.
         samples: Shape (n,), dtype SAMPLE. A sample without a time has no effect.
         cells_v: Cell voltages, shape (n, cells) [V]; an array of another length if none are measured.
@@ -79,12 +79,12 @@ def evaluate(
         cutoff_risk: Probability of the cut-off within 5 min at each row of ``trace``, 0..1, or a single one for all of them;
             NaN without a forecast.
         scratch: Six rows of at least n and at least ``SAMPLE_ALARMS`` elements; overwritten.
-        log: Receives the changes, dtype LOG, from ``part.logged`` on.
+        log: Receives the changes, dtype LOG, from ``io.logged`` on.
 
     Returns:
         True if the values of dtype COUNTS differ from those reported.
     """
-    a, p, b, e = alarms[0], settings[0], part[0], estimator[0]
+    a, p, b, e = alarms[0], settings[0], io[0], estimator[0]
     states = a.states
     a.quantities[CELLS].max_count = min(a.quantities[CELLS].max_count, int(p.series))  # the settings may have changed
     b.inputs_evaluated = 0
@@ -95,7 +95,7 @@ def evaluate(
             states[k].raised = 0
     end_s = _evaluate_samples(a, limits, p, b, samples, cells_v, scratch, log)
     if not math.isnan(end_s):
-        update_quantities(alarms, limits, settings, part, samples, scratch, log, end_s)
+        update_quantities(alarms, limits, settings, io, samples, scratch, log, end_s)
         _evaluate_inputs(a, limits, p, b, e, log, end_s)
     if trace.shape[0]:
         _evaluate_estimates(a, limits, p, b, trace, cutoff_risk, e.checks.suspects & p.model_suspects != 0, log)
@@ -140,7 +140,7 @@ def update_alarm(
     alarms: Records,
     limits: Records,
     settings: Records,
-    part: Records,
+    io: Records,
     log: Records,
     k: int,
     at_s: float,
@@ -148,16 +148,16 @@ def update_alarm(
     value: float,
 ) -> None:
     """Process a value of alarm ``k`` that no sample contains. ``states.update`` describes the last three arguments."""
-    update(alarms[0].states[k], limits[k], settings[0], part[0], log, k, at_s, step_s, value, 0)
+    update(alarms[0].states[k], limits[k], settings[0], io[0], log, k, at_s, step_s, value, 0)
 
 
 @njit(cache=True)
 def raise_alarm(
-    alarms: Records, limits: Records, part: Records, log: Records, k: int, since_s: float, value: float
+    alarms: Records, limits: Records, io: Records, log: Records, k: int, since_s: float, value: float
 ) -> None:
     """Raise alarm ``k`` at the last sample, without its delay. ``states.raise_now`` describes the last two arguments."""
     a = alarms[0]
-    raise_now(a.states[k], limits[k], part[0], log, k, a.samples.last_s, since_s, value)
+    raise_now(a.states[k], limits[k], io[0], log, k, a.samples.last_s, since_s, value)
 
 
 @njit(cache=True)

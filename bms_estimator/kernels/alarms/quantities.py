@@ -1,6 +1,6 @@
 """Intervals between samples, loss of measured quantities, and the alarms that cannot be watched because of it.
 
-``a`` is a record of ALARMS, ``p`` of SETTINGS, ``b`` of PART, ``s`` of ALARM, ``d`` of LIMITS.
+``a`` is a record of ALARMS, ``p`` of SETTINGS, ``b`` of EVALUATION_IO, ``s`` of ALARM, ``d`` of LIMITS.
 """
 
 import math
@@ -57,7 +57,7 @@ def update_quantities(
     alarms: Records,
     limits: Records,
     settings: Records,
-    part: Records,
+    io: Records,
     samples: Records,
     scratch: Floats,
     log: Records,
@@ -74,22 +74,22 @@ def update_quantities(
             step_s, count = scratch[0, j], int(scratch[1 + q, j])
             if step_s >= 0.0 and _step_quantity(a.quantities[q], step_s, count, p.lost_s) and math.isnan(changed_s):
                 changed_s = samples[j].time_s
-    update_unwatched(alarms, limits, part, log, end_s if math.isnan(changed_s) else changed_s)
+    update_unwatched(alarms, limits, io, log, end_s if math.isnan(changed_s) else changed_s)
     if not math.isnan(changed_s) and is_blinded(a.states, limits, lost_quantities(a)):
         # the delay of the alarm is skipped, because the quantity has been missing for ``lost_s`` already
-        s, d, b = a.states[SENSOR_FAULT], limits[SENSOR_FAULT], part[0]
+        s, d, b = a.states[SENSOR_FAULT], limits[SENSOR_FAULT], io[0]
         raise_now(s, d, b, log, SENSOR_FAULT, changed_s, changed_s + b.wall_offset_s, math.nan)
 
 
 @njit(cache=True)
-def update_unwatched(alarms: Records, limits: Records, part: Records, log: Records, at_s: float) -> None:
+def update_unwatched(alarms: Records, limits: Records, io: Records, log: Records, at_s: float) -> None:
     """Update the alarms that cannot be watched at ``at_s`` [s], because a quantity is lost or no samples arrive.
 
     ``evaluate.evaluate`` describes the other arguments. An alarm counts as watched if a quantity that it needs was never
     measured, because it could not be evaluated before either. A critical alarm whose delay runs stays unwatched, so that a
     relay does not close before the alarm is raised.
     """
-    a, b = alarms[0], part[0]
+    a, b = alarms[0], io[0]
     lost = lost_quantities(a)
     measured = lost  # a quantity of which all values were unusable is lost without a measured value
     for q in range(QUANTITIES):

@@ -122,8 +122,11 @@ SETTINGS = np.dtype(
         ("lost_s", "f8"),  # time without values after which a quantity is lost [s]
         ("charging_a", "f8"),  # minimum current that counts as charging [A]
         ("series", "f8"),  # cells in series
-        ("max_a", "f8"),  # highest possible current [A]
-        ("range_a", "f8"),  # highest usual current [A]
+        ("max_a", "f8"),  # highest current that the pack can have; a higher one is a faulty input [A]
+        (
+            "range_a",
+            "f8",
+        ),  # highest current of usual loads; limit if the voltage shows that the source sends mV and mA [A]
         ("low_v", "f8"),  # lowest and highest usual voltage of the pack [V]
         ("high_v", "f8"),
         # voltages beyond which a wire may be broken, so that the alarm of the opposite limit is uncertain [V]
@@ -136,12 +139,15 @@ SETTINGS = np.dtype(
     align=True,
 )
 """Settings of the evaluation of a pack's alarms."""
-PART = np.dtype(
+EVALUATION_IO = np.dtype(
     [
         ("wall_offset_s", "f8"),  # wall clock minus the samples' clock [s]
-        ("cells_at_s", "f8"),  # time of a new estimate of the single cells [s]; NaN: none
+        (
+            "cells_at_s",
+            "f8",
+        ),  # time of a new estimate of the single cells [s]; NaN: no new one, and the next two fields are not used
         ("short_a", "f8"),  # largest proven self-discharge of a cell [A]
-        ("reading_v", "f8"),  # largest error of a reading of a cell [V]
+        ("reading_v", "f8"),  # largest error of the measured voltage of a cell [V]
         ("weak_cell_std", "f8"),  # deviation of a bank's last discharge from its reference [std]; NaN: unknown
         ("lost", "i8"),  # number of samples since start that were lost on the line
         ("is_silent", "i8"),  # 1: no samples arrive, or they have arrived again for a short time only
@@ -156,7 +162,7 @@ PART = np.dtype(
     ],
     align=True,
 )
-"""Inputs of the evaluation of a part of a block, beside its samples, and results."""
+"""Further inputs of an evaluation, beside the samples, and its results."""
 LOG = np.dtype(
     [
         ("alarm", "i8"),  # position in ``NAMES``

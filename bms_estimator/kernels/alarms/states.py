@@ -26,7 +26,7 @@ def update(
         s: State of the alarm, a record of dtype ALARM.
         d: Its definition, a record of dtype LIMITS.
         p: Record of dtype SETTINGS.
-        b: Record of dtype PART.
+        b: Record of dtype EVALUATION_IO.
         log: Receives the changes, dtype LOG.
         k: Position of the alarm.
         at_s: Time on the samples' clock [s].
@@ -83,7 +83,7 @@ def raise_now(s: Record, d: Record, b: Record, log: Records, k: int, at_s: float
     Args:
         s: State of the alarm, a record of dtype ALARM.
         d: Its definition, a record of dtype LIMITS.
-        b: Record of dtype PART.
+        b: Record of dtype EVALUATION_IO.
         log: Receives the change, dtype LOG.
         k: Position of the alarm.
         at_s: Time on the samples' clock [s].
@@ -96,14 +96,14 @@ def raise_now(s: Record, d: Record, b: Record, log: Records, k: int, at_s: float
 
 
 @njit(cache=True)
-def acknowledge(alarms: Records, part: Records, log: Records, k: int, at_s: float) -> None:
+def acknowledge(alarms: Records, io: Records, log: Records, k: int, at_s: float) -> None:
     """Acknowledge raised alarm ``k`` at ``at_s`` on the samples' clock [s]. It ends now if its cause is gone."""
     s = alarms[0].states[k]
     s.acknowledged, s.accepts_uncertain = 1, s.is_uncertain
     if s.cause_cleared and s.holds:  # the cause has returned, and the delay runs
         s.cause_cleared, s.holds, s.held_s = 0, 0, 0.0
     if s.cause_cleared:
-        _end(s, part[0], log, k, at_s)
+        _end(s, io[0], log, k, at_s)
 
 
 @njit(cache=True)

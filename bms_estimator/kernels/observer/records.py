@@ -15,12 +15,11 @@ OBSERVER_SETTINGS = np.dtype(
         ("ocv_v", "f8", OCV_POINTS),  # E_o over SOC 0..1 [V]
         ("ocv_slope_v", "f8", OCV_POINTS),  # dE_o/dSOC [V]
         ("a_initial", "f8", PARAMETERS),  # a_i(t0)
-        # target: limit to which (3.18) leads a_i, (lx au + ly al) / (lx + ly) with bounds al, au and weights lx, ly of
-        # the bounds (Lemma 4.1.3)
+        # value that a_i approaches by (3.18): mean of its upper bound au with weight lx and its lower bound al with weight ly
         ("target", "f8", PARAMETERS),
         ("rate", "f8", PARAMETERS),  # rate of that approach: lx + ly of (3.18), lambda of (3.17) [1/s]
         ("drive", "f8", PARAMETERS),  # 1: e^2 drives the parameter; 0: the parameter is constant
-        ("output_r_s", "f8"),  # 1: the output contains u R_s (3.14); 0: the output is (4.1)
+        ("output_r_s", "f8"),  # 1: the output contains the ohmic drop u R_s (3.14); 0: it does not (4.1)
         ("nussbaum", "i8"),  # kernels.observer.nussbaum.Nussbaum
         ("alpha", "f8"),  # a of (3.10), in (2, 3]
         ("gain_scale", "f8"),  # lambda^(1/a) of (3.10) [1/(V^2 s)]
@@ -29,10 +28,11 @@ OBSERVER_SETTINGS = np.dtype(
         ("ml_decay_slope", "f8", TABLE_POINTS),  # second table of ``decay_table``
         ("k0", "f8"),  # k(t0) [V^2 s]
         ("gain_limit", "f8"),  # clamp of |N|
-        # In lock, k is reset to k0 when N(k) falls below ``rearm_gain``. There is no reset if it is -inf or at least N(k0).
+        # In lock, k is reset to k0 when N(k) falls below ``rearm_gain``, so that the gain does not become negative. No reset
+        # occurs if it is -inf, or if it is at least N(k0), because the reset would not raise the gain above it.
         ("rearm_gain", "f8"),
         ("dead_zone_v", "f8"),  # e_dead of erratum 2 [V]; 0 gives the printed (3.13)
-        ("epsilon_v", "f8"),  # eps2 of Algorithm 1 [V]
+        ("epsilon_v", "f8"),  # eps2 of Algorithm 1: |e| below which an estimate counts as converged [V]
         ("lock_error_v", "f8"),  # |e| beyond which the observer does not track [V]
         ("lock_time_s", "f8"),  # time with |e| beyond or within lock_error_v until the lock is lost or regained [s]
         ("margin_guard", "f8"),  # SOC distance above max(delta1, delta2) at which adaptation stops
@@ -45,7 +45,7 @@ OBSERVER_SETTINGS = np.dtype(
         ("check_v", "f8"),  # ohmic drop up to which a change of the current is not checked [V]
         # A longer step is a gap, unless it is at most GAP_RATIO times the previous step [s]
         ("gap_s", "f8"),
-        ("unmeasured_s", "f8"),  # longest step over which the current counts as measured [s]
+        ("unmeasured_s", "f8"),  # longest step over which the charge is integrated from the currents at its ends [s]
     ],
     align=True,
 )
@@ -63,7 +63,7 @@ OBSERVER_STATE = np.dtype(
         ("k", "f8"),  # adaptive gain state (3.13) [V^2 s]
         ("gain", "f8"),  # N(k) of a Nussbaum law, or gamma k of the learning law [1/s]
         ("a", "f8", PARAMETERS),  # a1..a15 (3.16)-(3.18)
-        ("target", "f8", PARAMETERS),  # limit of (3.18); the identifier changes it
+        ("target", "f8", PARAMETERS),  # value that a_i approaches by (3.18); the identifier changes it
         ("decay", "f8", PARAMETERS),  # e^(-rate dt) for ``decay_dt_s``
         ("settle", "f8", PARAMETERS),  # (1 - decay) / rate for ``decay_dt_s`` [s]
         ("decay_dt_s", "f8"),
@@ -71,7 +71,7 @@ OBSERVER_STATE = np.dtype(
         ("voltage_estimate_v", "f8"),  # y^ after the sample corrected the states (4.1)
         ("delta_1", "f8"),  # SOC below which C_ts of the model is negative (2.11)
         ("delta_2", "f8"),  # SOC below which C_tl of the model is negative (2.12)
-        ("unlocked_s", "f8"),  # time for which |e| has contradicted ``lock``, in or out of lock [s]
+        ("unlocked_s", "f8"),  # in lock: time with |e| beyond lock_error_v; otherwise: time with |e| within it [s]
         ("started", "i8"),  # 1: initialized by a first sample
         ("lock", "i8"),  # 1 while the observer tracks
         ("adapting", "i8"),  # 1 while the parameters adapt; 0 at an SOC below the stability floor

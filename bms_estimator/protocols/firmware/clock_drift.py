@@ -1,8 +1,8 @@
 """Rate error of the board's clock relative to the host's, from the smallest delays of its samples.
 
 Line, USB bridge and scheduler delay a sample, but never advance it. Therefore only the sample with the smallest delay in
-each ten seconds is used. The rate follows from the lower convex hull of these delays (Moon, Skelly, Towsley 1999). Other
-delayed samples do not affect the result. The result does not change the times of the samples.
+each ten seconds is used. The rate follows from the lower convex hull of these delays (Moon, Skelly, Towsley 1999). The
+estimate is only reported; the times of the samples are not corrected.
 
 ``d`` is the state of the frame decoder, a record of ``framing.DECODER``.
 """

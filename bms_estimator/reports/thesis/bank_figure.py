@@ -83,7 +83,8 @@ class BankExperiment:
     def dips(self) -> list[float]:
         """Charge drawn at which E_o of the faulty bank falls fastest below the healthy one, for each weak battery."""
         lost_v = np.interp(self.faulty.drawn, self.healthy.drawn, self.healthy.e_o_v) - self.faulty.e_o_v
-        slope_v, middle = np.diff(lost_v) / np.diff(self.faulty.drawn), midpoints(self.faulty.drawn)
+        drawn = self.faulty.drawn
+        slope_v, middle = np.diff(lost_v) / np.diff(drawn), 0.5 * (drawn[1:] + drawn[:-1])
         found: list[float] = []
         for j in np.argsort(-slope_v).tolist():
             if len(found) < len(WEAK_SOC) and all(abs(middle[j] - other) > MIN_DIP_DISTANCE for other in found):
@@ -130,8 +131,3 @@ class BankExperiment:
         measured = OpenCircuit.of(self._curves, self._fit, rows, soc)
         e_o_v = SERIES * (measured.error_v + fitted_ocv(self._curves, self._fit, soc))
         return BankDischarge(1.0 - soc, e_o_v)
-
-
-def midpoints(values: Floats) -> Floats:
-    """Return the means of neighbors, shape (n - 1,)."""
-    return np.asarray(0.5 * (values[1:] + values[:-1]))

@@ -58,7 +58,7 @@ class SetupServer(WebServer):
             "/compare/zero": functools.partial(self._compare, "zero"),
             "/compare/current": functools.partial(self._compare, "current"),
             "/compare/direction": functools.partial(self._compare, "direction"),
-            "/continue": self._continue,
+            "/continue": lambda _: self._session.finish_comparison(),
             "/pack": self._create,
         }
         super().__init__(
@@ -126,9 +126,6 @@ class SetupServer(WebServer):
 
     async def _compare(self, quantity: str, fields: Fields) -> None:
         await self._session.compare(quantity, fields.get("value", "").strip())
-
-    async def _continue(self, _: Fields) -> None:
-        await self._session.finish_comparison()
 
     async def _create(self, fields: Fields) -> None:
         self._session.create(fields)

@@ -166,7 +166,7 @@ def _signals(settings: CanSource) -> Iterator[tuple[SignalKey, Signal]]:
 
 
 def _load_profile(profile: str | None) -> Database:
-    """Load the DBC file of a profile."""
+    """Load the DBC file of a profile, which settings without ``dbc`` always have."""
     database = Database()
     database.add_dbc_string((resources.files("bms_estimator.sources.fieldbus") / f"{profile}.dbc").read_text())
     return database

@@ -207,7 +207,7 @@ class SerialSource:
         self._decoded.set()
         return block
 
-    async def current_zero(self) -> None:
+    async def store_current_zero(self) -> None:
         """Make the board store the present current as zero. The load must be disconnected.
 
         Later samples are decoded with the new zero. Another task must iterate over the blocks meanwhile.

@@ -82,7 +82,7 @@ class AlarmList:
             value: Value in the unit of the alarm; NaN without a number.
         """
         kernel = self.kernel
-        raise_alarm(self.record, self.definitions.limits, kernel.part, kernel.log, NAMES.index(name), since_s, value)
+        raise_alarm(self.record, self.definitions.limits, kernel.io, kernel.log, NAMES.index(name), since_s, value)
         self.take_changes()
 
     def update(self, name: AlarmName, passed_s: float, value: float, now_s: float) -> None:
@@ -95,23 +95,23 @@ class AlarmList:
             now_s: Wall clock [s since 1970].
         """
         kernel, limits, settings = self.kernel, self.definitions.limits, self.definitions.settings
-        kernel.part["wall_offset_s"] = now_s - self.at_s
+        kernel.io["wall_offset_s"] = now_s - self.at_s
         k = NAMES.index(name)
-        update_alarm(self.record, limits, settings, kernel.part, kernel.log, k, self.at_s, passed_s, value)
+        update_alarm(self.record, limits, settings, kernel.io, kernel.log, k, self.at_s, passed_s, value)
         self.take_changes()
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:
         """Acknowledge an alarm; None: all. Return the acknowledged ones. Alarms whose cause is gone end now."""
         acknowledged = [each for each in self.active if name in (None, each)]
         for each in acknowledged:
-            acknowledge(self.record, self.kernel.part, self.kernel.log, self.positions[each], self.at_s)
+            acknowledge(self.record, self.kernel.io, self.kernel.log, self.positions[each], self.at_s)
         self.take_changes()
         return acknowledged
 
     def set_silence(self, reason: str) -> None:
         """Change ``silence_reason``, and with it the alarms that cannot be watched."""
-        self.silence_reason, self.kernel.part["is_silent"] = reason, bool(reason)
-        update_unwatched(self.record, self.definitions.limits, self.kernel.part, self.kernel.log, self.at_s)
+        self.silence_reason, self.kernel.io["is_silent"] = reason, bool(reason)
+        update_unwatched(self.record, self.definitions.limits, self.kernel.io, self.kernel.log, self.at_s)
         self.take_changes()
 
     def take_changes(self, reason_at: Callable[[float], str] = lambda _: "") -> None:

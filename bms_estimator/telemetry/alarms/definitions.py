@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.alarms.evaluate import evaluate
-from bms_estimator.kernels.alarms.records import LIMITS, LOG, NAMES, PART, SAMPLE_ALARMS, SETTINGS
+from bms_estimator.kernels.alarms.records import EVALUATION_IO, LIMITS, LOG, NAMES, SAMPLE_ALARMS, SETTINGS
 from bms_estimator.kernels.alarms.values import BROKEN_WIRE_V
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.input_faults import InputFault
@@ -27,7 +27,7 @@ SENSOR_SUSPECTS = (
 """Input faults that raise ``sensor_fault``."""
 MODEL_SUSPECTS = InputFault.CAPACITY | InputFault.OCV
 """Input faults that raise ``model_mismatch``."""
-NO_RISK = np.full(1, np.nan)
+UNKNOWN_RISK = np.full(1, np.nan)
 """Probability of a cut-off for a pack without forecasts."""
 _MAX_CHANGES_PER_SAMPLE = len(NAMES)
 """Maximum number of changes by a sample and its estimate."""
@@ -88,15 +88,15 @@ class EvaluationKernel:
     """Kernel that evaluates the alarms, with its buffers.
 
     Attributes:
-        part: Further inputs of the kernel and its results, shape (1,), dtype ``PART``.
+        io: Further inputs of the kernel, and its results, shape (1,), dtype ``EVALUATION_IO``.
         log: Buffer of the changes, dtype ``LOG``; ``entries`` returns those since the last call of ``clear``.
     """
 
     def __init__(self) -> None:
-        self.part, self.log = np.zeros(1, PART), np.zeros(_MAX_CHANGES_PER_SAMPLE, LOG)
+        self.io, self.log = np.zeros(1, EVALUATION_IO), np.zeros(_MAX_CHANGES_PER_SAMPLE, LOG)
         for name in ("cells_at_s", "short_a", "reading_v", "weak_cell_std"):
-            self.part[name] = np.nan
-        self._scratch = np.zeros((6, SAMPLE_ALARMS))
+            self.io[name] = np.nan
+        self._scratch = np.zeros((6, SAMPLE_ALARMS))  # rows that the kernel requires
 
     def run(
         self,
@@ -106,19 +106,22 @@ class EvaluationKernel:
         samples: SampleBlock,
         cells_v: CellBlock,
         trace: TraceBlock,
-        cutoff_risk: Floats = NO_RISK,
+        cutoff_risk: Floats = UNKNOWN_RISK,
     ) -> bool:
-        """Evaluate all alarms as ``kernels.alarms.evaluate`` does, with buffers that are long enough."""
+        """Evaluate all alarms with buffers that are long enough.
+
+        ``kernels.alarms.evaluate`` describes arguments and result.
+        """
         if self._scratch.shape[1] < samples.size:
             self._scratch = np.zeros((6, samples.size))
-        rows = int(self.part["logged"][0]) + _MAX_CHANGES_PER_SAMPLE * (samples.size + 1)
+        rows = int(self.io["logged"][0]) + _MAX_CHANGES_PER_SAMPLE * (samples.size + 1)  # + 1: alarms evaluated once
         if self.log.size < rows:
             self.log = np.concatenate((self.entries, np.empty(rows, LOG)))
         return evaluate(
             alarms,
             definitions.limits,
             definitions.settings,
-            self.part,
+            self.io,
             estimator,
             samples,
             np.ascontiguousarray(cells_v),
@@ -131,8 +134,8 @@ class EvaluationKernel:
     @property
     def entries(self) -> NDArray[np.void]:
         """Changes since the last call of ``clear``, oldest first, dtype ``LOG``."""
-        return self.log[: int(self.part["logged"][0])]
+        return self.log[: int(self.io["logged"][0])]
 
     def clear(self) -> None:
         """Remove all changes."""
-        self.part["logged"] = 0
+        self.io["logged"] = 0

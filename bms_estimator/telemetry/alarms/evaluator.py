@@ -63,7 +63,7 @@ class AlarmEvaluator:
 
         A relay may only then follow the alarms, because before that a due alarm may not be raised yet.
         """
-        watched_s = float(self._alarms.kernel.part["watched_s"][0])  # NaN during a silence
+        watched_s = float(self._alarms.kernel.io["watched_s"][0])  # NaN during a silence
         return watched_s >= max(self._lost_s, MIN_WATCHED_S) and not self._alarms.pending
 
     def evaluate(
@@ -101,7 +101,7 @@ class AlarmEvaluator:
         alarms, causes = self._alarms, self._alarms.causes
         samples, was_faulty = self._probe_faults.add(samples, probes), alarms.is_raised("sensor_fault")
         self._set_suspects()
-        part, times_s = alarms.kernel.part, samples["time_s"]
+        part, times_s = alarms.kernel.io, samples["time_s"]
         if cells_fault:
             causes.input_faults.add("cells", cells_fault, cells_fault)
         part["cells_unusable"] = bool(cells_fault)
@@ -141,7 +141,7 @@ class AlarmEvaluator:
         """
         alarms, is_silent = self._alarms, silent_s >= self._silence_limit_s
         if is_silent:
-            alarms.kernel.part["watched_s"], self._silence_s = math.nan, steady_s
+            alarms.kernel.io["watched_s"], self._silence_s = math.nan, steady_s
         elif (
             alarms.silence_reason
         ):  # due alarms are raised before the silence ends, so that a relay does not close in between
@@ -293,7 +293,7 @@ class AlarmEvaluator:
             faults.add("time", "rate", clock_fault or WRONG_CLOCK_TEXT)
         if probe_fault := self._probe_faults.take():
             faults.add("temperature", "probe", probe_fault)
-        for quantity, row in zip(QUANTITIES, alarms.kernel.part["impossible"][0].tolist(), strict=True):
+        for quantity, row in zip(QUANTITIES, alarms.kernel.io["impossible"][0].tolist(), strict=True):
             if row:  # one above the index of a sample; 0: no impossible value
                 cells = cells_v[row - 1] if len(cells_v) == samples.size else NO_CELLS
                 faults.add(quantity, *alarms.definitions.bounds.describe(quantity, samples[row - 1], cells))

@@ -8,8 +8,6 @@ from bms_estimator import load_capture
 from tests.command_line import run
 from tests.telemetry.alarm_captures import Line, record
 
-BDF_HEADER = "Test Time / s,Voltage / V,Current / A,Surface Temperature / degC"
-
 
 @pytest.fixture
 def board(data):
@@ -59,7 +57,7 @@ def test_battery_data_format_restores_the_samples_from_time_zero(capsys, tmp_pat
 def test_battery_data_format_has_preferred_labels_charge_positive_current_and_empty_cells(capsys, tmp_path, board):
     run(capsys, "convert", board, "--out", tmp_path / "out.bdf")
     header, first = (tmp_path / "out.bdf").read_text().splitlines()[:2]
-    assert header == BDF_HEADER
+    assert header == "Test Time / s,Voltage / V,Current / A,Surface Temperature / degC"
     capture = load_capture(board)
     assert first == f"0.0,{capture['voltage_v'][0]},{-capture['current_a'][0]},"
 

@@ -364,11 +364,6 @@ def test_replay_equals_estimate_bit_for_bit(data, tmp_path, capsys):
         assert np.array_equal(columns[name], trace[name], equal_nan=True), name
 
 
-def as_gzip(path):
-    """Return the bytes of the file, compressed."""
-    return gzip.compress(path.read_bytes())
-
-
 def as_raw(path):
     """Return the bytes of a recording of a board that prints the samples of a CSV file as text lines."""
     recorded = path.with_name("small.bms")
@@ -404,7 +399,13 @@ def replay_stdin(monkeypatch, capsys, data, *arguments):
 
 @pytest.mark.parametrize(
     "convert",
-    [Path.read_bytes, as_gzip, as_parquet, as_raw, lambda path: gzip.compress(as_raw(path))],
+    [
+        Path.read_bytes,
+        lambda path: gzip.compress(path.read_bytes()),
+        as_parquet,
+        as_raw,
+        lambda path: gzip.compress(as_raw(path)),
+    ],
     ids=["CSV", "CSV.gz", "Parquet", "raw", "raw.gz"],
 )
 def test_capture_of_every_format_is_read_from_stdin(convert, capture, monkeypatch, capsys):

@@ -10,8 +10,6 @@ from bms_estimator.model.cell import ChenMoraOcv, TableOcv, load_cell
 from tests.calibration.simulated_relaxation import INVALID_CAPTURES, relaxation
 from tests.command_line import run
 
-RELAXATION_FILE = "cell5_relaxation_c2.csv.gz"
-
 
 def save(path, samples):
     """Write samples to a CSV file. Return its path."""
@@ -30,7 +28,7 @@ def captures(tmp_path_factory):
 @pytest.mark.parametrize(("form", "limit_mv"), [("chen-mora", 10.0), ("table", 2.0)])
 def test_curve_of_a_real_cell_fits_the_voltages_of_its_rests(tmp_path, capsys, shared_data, form, limit_mv):
     out = tmp_path / "cell5.toml"
-    capture = shared_data / "ncr18650" / RELAXATION_FILE
+    capture = shared_data / "ncr18650" / "cell5_relaxation_c2.csv.gz"
     code, text, err = run(capsys, "ocv", capture, "--capacity-ah", "3.0", "--form", form, "--out", out, "--json")
     assert (code, err) == (0, "")
     result = json.loads(text)

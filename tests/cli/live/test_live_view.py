@@ -14,7 +14,6 @@ from tests.patience import LONG_S
 from tests.pseudo_terminal import ALTERNATE, BACK, CURSOR, PseudoTerminal
 from tests.serial_line import Line
 
-SIZES = [(40, 15), (80, 24)]
 TEN_SCREENS = 300
 """Number of samples at 100 Hz while ten screens are drawn. A pseudo-terminal that is not read buffers one or two screens."""
 
@@ -31,7 +30,7 @@ def shows_soc(terminal: PseudoTerminal) -> bool:
     return re.search(r"demo +\d+\.\d\d ± \d+\.\d\d +\d+\.\d\d +live", "\n".join(terminal.screen())) is not None
 
 
-@pytest.mark.parametrize(("columns", "rows"), SIZES, ids=str)
+@pytest.mark.parametrize(("columns", "rows"), [(40, 15), (80, 24)], ids=str)
 def test_main_values_are_shown_on_any_screen_size(demo: PseudoTerminal, columns: int, rows: int) -> None:
     demo.resize(columns, rows)
     demo.until(lambda: len(demo.screen()) == rows and max(map(len, demo.screen())) == columns)

@@ -408,7 +408,6 @@ def test_a_hypothesis_with_a_large_bias_loses_weight(right: int) -> None:
     assert likely == pytest.approx([socs[right]], abs=0.05)
 
 
-DRIVE_CASE = next(case for case in CASES if case.name == "oxide 25C")
 FAST_CASE = Case("100 Hz", rate_hz=100.0, hours=0.25, load_before_h=0.3, seed=5)
 
 
@@ -433,7 +432,7 @@ def test_rc_currents_of_the_calibration_equal_those_of_the_filter(dt_s: float) -
 @pytest.fixture(scope="module")
 def drive():
     """Return the capture of a drive at 1 Hz."""
-    return capture(DRIVE_CASE)
+    return capture(next(case for case in CASES if case.name == "oxide 25C"))
 
 
 @pytest.fixture(scope="module")

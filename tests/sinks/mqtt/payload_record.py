@@ -40,7 +40,7 @@ def find_broken(before: dict[str, str], after: dict[str, str]) -> list[str]:
 
 def _walk(path: str, node: dict[str, Any], models: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield path and types of a part of a JSON schema, and of all parts inside it."""
-    parts = [_resolve(part, models) for part in node.get("anyOf", [node])]
+    parts = [models[part["$ref"].rsplit("/", 1)[-1]] if "$ref" in part else part for part in node.get("anyOf", [node])]
     yield path, ", ".join(sorted({part.get("type", "any") for part in parts}))
     for part in parts:
         for name, inner in part.get("properties", {}).items():
@@ -48,11 +48,6 @@ def _walk(path: str, node: dict[str, Any], models: dict[str, Any]) -> Iterator[t
         for key, suffix in (("additionalProperties", "*"), ("items", "[]")):
             if isinstance(part.get(key), dict):
                 yield from _walk(f"{path}.{suffix}", part[key], models)
-
-
-def _resolve(node: dict[str, Any], models: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema to which ``node`` refers, or ``node`` itself."""
-    return models[node["$ref"].rsplit("/", 1)[-1]] if "$ref" in node else node
 
 
 def main() -> int:

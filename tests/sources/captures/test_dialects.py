@@ -9,8 +9,6 @@ from bms_estimator import load_capture
 from bms_estimator.model.columns import Columns
 from tests.sources.captures.cycler_exports import EXPORTS, Export, compressed, measure, stamps, text
 
-WITH_NAME = {"argvalues": EXPORTS, "ids": [export.write.__name__ for export in EXPORTS]}
-
 
 def assert_is_the_measurement(capture: Columns, *, has_temperature: bool) -> None:
     expected = measure()
@@ -21,7 +19,7 @@ def assert_is_the_measurement(capture: Columns, *, has_temperature: bool) -> Non
     np.testing.assert_allclose(capture["temperature_c"], temperature_c, atol=1e-9)
 
 
-@pytest.mark.parametrize("export", **WITH_NAME)
+@pytest.mark.parametrize("export", EXPORTS, ids=[export.write.__name__ for export in EXPORTS])
 def test_export_is_read_without_options(export: Export, tmp_path: Path) -> None:
     capture = load_capture(export.save(tmp_path))
     assert_is_the_measurement(capture, has_temperature=export.has_temperature)

@@ -30,8 +30,6 @@ from tests.sources.captures.history_exports import (
     json_period,
 )
 
-PAIR = {"voltage": VOLTAGE, "current": CURRENT}
-
 
 def load(folder: Path, text: str, column_map: str = "") -> Columns:
     """Return the samples of a file with a text."""
@@ -94,7 +92,7 @@ def test_value_holds_for_an_hour_without_a_change_and_no_longer(tmp_path: Path) 
         for second, voltage, current in ((0.0, "26.5", "-10"), (3000.0, "26.4", "-9"), (10_200.0, "26.3", "-8"))
         for entity, state in ((VOLTAGE, voltage), (CURRENT, current))
     ]
-    samples = load(tmp_path, home_assistant_csv(rows), ",".join(f"{key}={name}" for key, name in PAIR.items()))
+    samples = load(tmp_path, home_assistant_csv(rows), f"voltage={VOLTAGE},current={CURRENT}")
     steps_s = np.diff(samples["time_s"])
     assert samples["time_s"][-1] == pytest.approx(10_200.0)
     assert steps_s[-1] == pytest.approx(7200.0)

@@ -216,7 +216,7 @@ async def test_tap_receives_all_bytes_with_arrival_times_by_the_wall_clock(line:
 async def test_command_to_a_board_that_prints_text_is_rejected(line: Line) -> None:
     async with text_source(line) as source:
         with pytest.raises(UserError, match="takes no commands"):
-            await source.current_zero()
+            await source.store_current_zero()
 
 
 async def test_samples_after_current_zero_are_decoded_with_the_new_zero_which_is_not_reported() -> None:
@@ -229,7 +229,7 @@ async def test_samples_after_current_zero_are_decoded_with_the_new_zero_which_is
             source.board_check.on_recalibrated = reported.append
             await until(lambda: sample_count(blocks) >= 20 and source.board_check.serial)
             assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.5, abs=0.03)
-            await source.current_zero()
+            await source.store_current_zero()
             blocks.clear()
             await until(lambda: sample_count(blocks) >= 20)
             assert np.concatenate(blocks)["current_a"].mean() == pytest.approx(0.0, abs=0.03)
