@@ -105,7 +105,7 @@ class AlarmEvaluator:
         if cells_fault:
             causes.input_faults.add("cells", cells_fault, cells_fault)
         io["cells_unusable"] = bool(cells_fault)
-        alarms.record["faults"] |= (bool(cells_fault) << CELLS) | (bool(causes.board) << FAULTY_BOARD)
+        alarms.record["faults"] |= (bool(cells_fault) << CELLS) | (bool(causes.board_fault) << FAULTY_BOARD)
         last_s = (
             times_s[-1] if math.isfinite(times_s[-1]) else np.append(alarms.at_s, times_s[np.isfinite(times_s)])[-1]
         )
@@ -180,9 +180,9 @@ class AlarmEvaluator:
             reason: Reason why the board's resets are a fault; empty if they are not.
             now_s: Wall clock [s since 1970].
         """
-        if reason == self._alarms.causes.board:
+        if reason == self._alarms.causes.board_fault:
             return
-        self._alarms.causes.board = reason
+        self._alarms.causes.board_fault = reason
         if reason:
             self._alarms.raise_at("sensor_fault", now_s)
 
