@@ -214,9 +214,8 @@ def _evaluate_inputs(a: Record, limits: Records, p: Record, b: Record, e: Record
     is_first = not a.fraction.started
     if not is_first and 0.0 <= at_s - a.fraction.last_s < FRACTION_S:
         return
-    step_s = step_intervals(a.fraction, at_s, math.inf)[
-        1
-    ]  # gaps count toward the delay, because losses are also counted in gaps
+    # gaps count toward the delay, because losses are also counted in gaps
+    step_s = step_intervals(a.fraction, at_s, math.inf)[1]
     o = e.observer
     unusable = o.dropped_not_finite + o.dropped_range + o.dropped_saturated + b.lost
     good, bad = o.samples - a.accepted, unusable - a.unusable
