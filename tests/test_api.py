@@ -44,8 +44,8 @@ def test_every_public_name_exists():
 
 def test_an_estimator_identifies_parameters_unless_the_identifier_is_disabled():
     cell = bms_estimator.load_cell("leaf")
-    assert bms_estimator.Estimator(cell).identifying
-    assert not bms_estimator.Estimator(cell, identifier=None).identifying
+    assert bms_estimator.Estimator(cell).has_filter
+    assert not bms_estimator.Estimator(cell, identifier=None).has_filter
 
 
 def test_load_capture_accepts_a_table_and_rejects_it_like_a_file(data):

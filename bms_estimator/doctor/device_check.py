@@ -24,8 +24,6 @@ from bms_estimator.sources.serial.port_list import NoPortError, holder, resolve_
 NAME = "device"
 MIN_FIRST_SAMPLE_TIMEOUT_S = 8.0
 """Minimum time within which a device must send a sample [s]. Opening the port may reset a board, whose boot loader takes 2 s."""
-MIN_FIRST_SAMPLE_PERIODS = 2.0
-"""Minimum of that time in sample periods of the source."""
 CELLS_TIMEOUT_S = 2.0
 """Time after the first sample within which a device sends all cell voltages [s]. Some report them in several responses."""
 PSEUDO_TERMINALS = "/dev/pts/"
@@ -69,9 +67,9 @@ class FirstSample:
 
 
 def first_sample_timeout_s(settings: Settings) -> float:
-    """Return the time within which the device must send a sample [s]."""
+    """Return the time within which the device must send a sample [s]: at least two sample periods, and its longest silence."""
     silent_s = settings.source.max_silent_s if isinstance(settings.source, MqttSource) else None
-    return max(MIN_FIRST_SAMPLE_TIMEOUT_S, MIN_FIRST_SAMPLE_PERIODS * settings.sensor.sample_period_s, silent_s or 0.0)
+    return max(MIN_FIRST_SAMPLE_TIMEOUT_S, 2.0 * settings.sensor.sample_period_s, silent_s or 0.0)
 
 
 def load_decoder(subject: ExaminedPack) -> None:

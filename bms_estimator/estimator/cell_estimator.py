@@ -87,7 +87,7 @@ class CellEstimator:
     def __init__(self, estimator: Estimator) -> None:
         self._estimator, cell = estimator, estimator.cell
         self._series = cell.cell.series_count
-        self._enabled = estimator.identifying and self._series >= MIN_CELLS
+        self._enabled = estimator.has_filter and self._series >= MIN_CELLS
         self._balancing_v = balancing_voltage_v(cell)
         self._deviations: CellDeviations | None = None
         self._deviations_window = 0  # number of the window of ``_deviations``

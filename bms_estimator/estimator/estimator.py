@@ -149,8 +149,8 @@ class Estimator:
         return kernel.run(self.record, self.settings_record, block, trace)
 
     @property
-    def identifying(self) -> bool:
-        """True if the identifier is enabled."""
+    def has_filter(self) -> bool:
+        """True if the identifier, an extended Kalman filter, is enabled."""
         return bool(self.settings_record["identify"][0])
 
     @property
@@ -161,7 +161,7 @@ class Estimator:
     @property
     def soc_std(self) -> float:
         """Standard deviation of the weakest cell about ``soc``, which includes the imbalance; NaN without the identifier."""
-        if not (self.identifying and self.state["started"][0]):
+        if not (self.has_filter and self.state["started"][0]):
             return math.nan
         return float(weakest_cell_soc_std(self.record[0]["filter"], self.settings_record[0]["filter"]))
 
@@ -176,7 +176,7 @@ class Estimator:
         if not 0.0 <= soc <= 1.0:
             raise ValueError(f"SOC {soc} is outside 0..1")
         self.state["soc"] = self.state["soc_coulomb"] = soc
-        if self.identifying:
+        if self.has_filter:
             f, c = self.record[0]["filter"], self.record[0]["checks"]
             set_soc(f, self.settings_record[0]["filter"], soc)
             add_reference(self.record[0]["history"], NO_ANCHOR, soc, USER_SOC_STD)
@@ -276,7 +276,7 @@ class Estimator:
         """
         # inf: the next time step is not computed from the time of the last sample
         self.state["time_s"], self.record["unseen_s"] = np.inf, unseen_s
-        if self.identifying:
+        if self.has_filter:
             self.record["filter"]["soc"] = self.state["soc"]
             self.record["filter"]["smallest_a"] = 0.0  # the resolution is measured again
 

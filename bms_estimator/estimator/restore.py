@@ -65,7 +65,7 @@ def _restore(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: 
         return reason
     f = estimator.record["filter"]
     soc_difference = abs(f["soc"][0] - estimator.state["soc"][0])
-    if estimator.identifying and (not filter_was_on or soc_difference > MAX_SOC_DIFFERENCE):
+    if estimator.has_filter and (not filter_was_on or soc_difference > MAX_SOC_DIFFERENCE):
         unseen_s = math.inf  # the filter's state is outdated: resume as after a gap of unknown length
     _reset_switched_states(estimator)
     estimator.resume(unseen_s)
@@ -126,7 +126,7 @@ def _invalid_state_reason(estimator: Estimator, after_first_sample: NDArray[np.v
     if not (s["a"][is_used] > 0.0).all():
         return "a parameter a1..a15 is not positive"
     return _invalid_counter_reason(record) or (
-        _invalid_filter_reason(record[0]["filter"]) if estimator.identifying else ""
+        _invalid_filter_reason(record[0]["filter"]) if estimator.has_filter else ""
     )
 
 

@@ -55,22 +55,23 @@ class Heartbeat(BaseModel):
     """Largest lag since the previous heartbeat [s]: time from the arrival of a block's last sample at the edge to the
     processing of the block. None without a block."""
     counters: dict[str, int] = Field(default_factory=dict)
-    """Sums of the counters in the states of the claimed partitions, by name, such as resends, gaps and lost blocks. They include
-    events of former workers."""
+    """Sums of the counters of the claimed partitions, by name, such as resends, gaps and lost blocks. They are part of the
+    checkpoints, so that they go on counting when another worker takes a partition over."""
     events: dict[str, int] = Field(default_factory=dict)
     """Numbers of events in this worker since its start, by name. They include partitions that it has released."""
     unknown_count: int = 0
-    """Number of packs with deferred blocks that are missing in the table of packs."""
+    """Number of packs that are not in the table of packs. Their blocks are deferred."""
     unknown: tuple[str, ...] = ()
     """Names of some unknown packs."""
     clock_error_count: int = 0
     """Number of packs with a wrong clock at their edge (``worker.block_order``)."""
     clock_errors: dict[str, float] = Field(default_factory=dict)
-    """Largest errors of edges' clocks by pack [s]; positive if ahead."""
+    """Error of the edge's clock [s], positive if ahead, by pack; only the packs with the largest errors."""
     waiting: int = 0
     """Number of messages that were received from the server and not processed yet."""
     hours_waiting: int = 0
-    """Number of summaries and messages of histories that the server has not acknowledged yet."""
+    """Number of messages, not of hours: hourly summaries and messages of histories that the server has not acknowledged
+    yet."""
     unsaved_s: float = 0.0
     """Largest time for which a partition has had blocks that its last checkpoint does not include [s]."""
     checkpoint_s: float | None = None

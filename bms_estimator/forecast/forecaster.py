@@ -148,7 +148,7 @@ class Forecaster:
             values["usable_capacity_ah"] = np.median(projection.charge_as) / 3600.0
         return Forecast(time_s, values, None, projection.curve)
 
-    def trip_curve(self, load: GivenLoad) -> ForecastCurve | None:
+    def given_load_curve(self, load: GivenLoad) -> ForecastCurve | None:
         """Return the curves from the present state until the end of a given load; None without a state."""
         return (
             None if self._reason_without_state() else project_until_load_end(self.projected_pack(load), load, self.seed)
@@ -174,7 +174,7 @@ class Forecaster:
 
     def _reason_without_state(self) -> str | None:
         """Return the reason why the pack cannot be projected; None if it can."""
-        if not self.estimator.identifying:  # without the identifier there is no state of the filter to project
+        if not self.estimator.has_filter:  # there is no state to project
             return self.estimator.cell.no_forecast_reason
         if not self.estimator.record[0]["filter"]["started"]:
             return "no sample has been processed yet"

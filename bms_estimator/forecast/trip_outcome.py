@@ -46,7 +46,7 @@ def trip_outcome(trip: Trip, curve: ForecastCurve) -> TripOutcome:
 
     Args:
         trip: The trip.
-        curve: Curves until the end of the trip, of ``Forecaster.trip_curve``.
+        curve: Curves until the end of the trip, of ``Forecaster.given_load_curve``.
     """
     probability = float(curve.survival[-1])
     return TripOutcome(

@@ -13,7 +13,7 @@ HIDDEN_FOLDERS = (Path("/home"), Path("/root"), Path("/run/user"), Path("/tmp"),
 """Folders that the unit hides from the service by ProtectHome and PrivateTmp."""
 
 
-def is_hidden(path: Path) -> bool:
+def is_hidden_from_services(path: Path) -> bool:
     """Return True if the service cannot see a file."""
     return any(path.is_relative_to(folder) for folder in HIDDEN_FOLDERS)
 
@@ -32,7 +32,7 @@ def named_files(pack: Path) -> list[Path]:
     files = []
     for key, name in _paths_in(read_toml(pack, Settings)):
         if name.is_absolute():
-            if is_hidden(name.resolve()):
+            if is_hidden_from_services(name.resolve()):
                 raise UserError(
                     f"{pack}: {key} = {name}: the service cannot read this folder; "
                     f"move the file beside {pack.name}, and write {key} = {name.name}"

@@ -8,7 +8,7 @@ from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from importlib.util import cache_from_source
 from pathlib import Path
 
-from bms_estimator.installation.pack_files import is_hidden
+from bms_estimator.installation.pack_files import is_hidden_from_services
 from bms_estimator.model.errors import UserError
 
 DISTRIBUTION = "bms_estimator"
@@ -44,7 +44,7 @@ def system_python() -> Path:
     """
     for folder in (Path(sys.base_prefix, "bin"), Path("/usr/bin"), Path("/usr/local/bin")):
         python = folder / PYTHON
-        if python.exists() and not is_hidden(python.resolve()):
+        if python.exists() and not is_hidden_from_services(python.resolve()):
             return python
     raise UserError(
         f"{sys.base_prefix}: a service cannot run a Python in a home folder; "

@@ -30,15 +30,15 @@ class CellSlots:
 
     Attributes:
         fault: Fault of the last block if it has more live slots than cells in series, as a sentence; empty otherwise.
-        moved: Reason why a cell may be missing, as a sentence, if the last block has shown the cells in other slots than
-            ``earlier``; empty otherwise.
+        moved_reason: Reason why a cell may be missing, as a sentence, if the last block has shown the cells in other slots
+            than ``earlier``; empty otherwise.
     """
 
     def __init__(self, series: int, slots: Sequence[int] = (), earlier: Sequence[int] = ()) -> None:
         self._series, self._is_known = series, len(slots) == series
         self._slots = np.array(slots) if self._is_known else np.arange(series)
         self._earlier = list(earlier) if len(earlier) == series else []
-        self.fault = self.moved = self._excess_text = ""
+        self.fault = self.moved_reason = self._excess_text = ""
         self._excess_samples = 0  # number of successive samples with too many live slots
         # until enough cells are live: number of samples with live slots, and the largest number of live slots
         self._samples = self._max_cells = 0
@@ -75,7 +75,7 @@ class CellSlots:
         Args:
             cells_v: Voltages of the slots [V], NaN if not measured, shape (n, slots).
         """
-        self.fault = self.moved = ""
+        self.fault = self.moved_reason = ""
         if not cells_v.size:
             return cells_v
         if not self._has_enough:
@@ -109,7 +109,7 @@ class CellSlots:
                 slots, earlier = (
                     ", ".join(str(slot + 1) for slot in each) for each in (self.cell_indices, self._earlier)
                 )
-                self.moved = (
+                self.moved_reason = (
                     f"cells are measured in slots {slots}, and were in {earlier} before the restart: check their wires"
                 )
         if self._is_known:

@@ -320,12 +320,12 @@ def assemble(
         UserError: The cut-off voltage is not below the voltage of the full pack.
     """
     slow_fit = forecaster = None
-    if estimator.identifying and settings.identifier.pack_model:
+    if estimator.has_filter and settings.identifier.pack_model:
         slow_fit = new_fit(estimator, settings.identifier.fit_interval_s or FIT_INTERVAL_S)
-    if has_load and estimator.identifying:
+    if has_load and estimator.has_filter:
         cell = estimator.cell.battery("the identifier is of batteries")
         forecaster = Forecaster(estimator, cutoff_v=load_cutoff_v(settings, cell), limits=power_limits(settings, cell))
-    device_soc_std = settings.pack.device_soc_std if estimator.identifying else None
+    device_soc_std = settings.pack.device_soc_std if estimator.has_filter else None
     return Pack(
         estimator,
         slow_fit,

@@ -27,7 +27,7 @@ from bms_estimator.pack_model.intervals import HOUR_S
 MIN_CURVE_STD_V = 0.003
 """Minimum std of the OCV of one cell [V]. Assumed."""
 MIN_R_STD = Noise.r_std
-"""Minimum relative std of the resistances: the default without a std in the cell file."""
+"""Minimum relative std of the resistances; equal to the std that is assumed if the cell file has none."""
 MIN_SOC_STD_FRACTION = 0.55
 """Minimum std of the published SOC after a fit, as a fraction of the minimum with the curves of the cell file. Assumed: a fitted
 pack is known better than a cell that was not measured."""
@@ -51,7 +51,7 @@ def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> Non
 
     Args:
         settings: Record of dtype EKF_SETTINGS; written.
-        file_settings: Record of dtype EKF_SETTINGS by the cell file.
+        file_settings: Record of dtype EKF_SETTINGS with the values of the cell file.
         fit: Fit of the history.
     """
     _adopt_ocv(settings, file_settings, fit)
@@ -62,16 +62,21 @@ def adopt_curves(settings: np.void, file_settings: np.void, fit: PackFit) -> Non
 
 
 def _adopt_ocv(settings: np.void, file_settings: np.void, fit: PackFit) -> None:
-    """Write the fitted OCV and its std. The error by direction becomes ``varying_error_v``."""
+    """Write the fitted OCV and its std. The error that depends on the current's direction becomes ``varying_error_v``."""
     series = float(file_settings["series"])
     soc = np.linspace(0.0, 1.0, file_settings["ocv_v"].size)
     ocv_v = file_settings["ocv_v"] + series * np.interp(soc, SOC_GRID, fit.curve_v)
     settings["ocv_v"] = np.maximum.accumulate(ocv_v)  # an OCV increases with the SOC
     settings["ocv_slope_v"] = np.maximum(np.gradient(settings["ocv_v"], soc), MIN_SLOPE_V * series)
-    node_v2 = np.maximum(np.interp(SOC_GRID, NODE_SOC, np.diag(fit.covariance)[FIT_CURVE]), MIN_CURVE_STD_V**2)
+    curve_variance_v2 = np.maximum(
+        np.interp(SOC_GRID, NODE_SOC, np.diag(fit.covariance)[FIT_CURVE]), MIN_CURVE_STD_V**2
+    )
     direction_std_v = CellCurves(file_settings).direction_std_v
-    settings["constant_error_v"], settings["varying_error_v"] = series * np.sqrt(node_v2), series * direction_std_v
-    settings["curve_error_v"] = series * np.sqrt(node_v2 + direction_std_v**2)
+    settings["constant_error_v"], settings["varying_error_v"] = (
+        series * np.sqrt(curve_variance_v2),
+        series * direction_std_v,
+    )
+    settings["curve_error_v"] = series * np.sqrt(curve_variance_v2 + direction_std_v**2)
     settings["node_correlation"] = NODE_CORRELATION
 
 
@@ -82,6 +87,7 @@ def _adopt_resistances(settings: np.void, file_settings: np.void, fit: PackFit) 
     middle = SOC_GRID.size // 2
     settings["middle_ohm"] = settings["weak_ohm"][middle].sum() + settings["strong_ohm"][middle].sum()
     settings["r_std"] = r_std(fit)
+    # computed from the std as for the cell file, and never above its value
     settings["bias_relative"] = min(
         float(file_settings["bias_relative"]), max(Noise.bias_relative, MIN_BIAS_OF_R_STD * r_std(fit))
     )

@@ -22,7 +22,7 @@ def thin(x: Floats, *curves: Floats, points: int = MAX_POINTS) -> tuple[Floats, 
     Args:
         x: Shape (n,), common abscissa.
         *curves: Each of shape (n,).
-        points: Maximum number of remaining points. The last point, and at most half as many points for steps, are added.
+        points: Approximate number of points of the result, which are at most ``1.5 * points + 1``.
 
     Returns:
         Abscissa and curves, all of the same reduced length.

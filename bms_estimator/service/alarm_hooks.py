@@ -30,7 +30,8 @@ class AlarmHooks:
         clock: Time since boot of the host [s].
 
     Attributes:
-        is_watching: Returns True once enough samples have arrived to raise all due alarms (``AlarmMonitor.check_silence``).
+        check_watching: ``AlarmMonitor.check_silence``, which returns True once enough samples have arrived to raise all due
+            alarms. A relay hook calls it before each command.
 
     Raises:
         UserError: A hook needs something that is missing.
@@ -44,14 +45,14 @@ class AlarmHooks:
         board: RelayBoard | None,
         clock: Callable[[], float] = since_boot,
     ) -> None:
-        self.is_watching: Callable[[], bool] = lambda: True
+        self.check_watching: Callable[[], bool] = lambda: True
         self._hooks: list[Hook] = []
         for i, hook in enumerate(hooks):
             require_output(i, hook, broker=publish is not None, relay=board is not None)
             if hook.topic and publish:
                 self._hooks.append(PublishHook(hook, device, hook.topic, publish))
             elif hook.relay and board:
-                self._hooks.append(RelayHook(hook, board, clock, lambda: self.is_watching()))  # noqa: PLW0108 - set later
+                self._hooks.append(RelayHook(hook, board, clock, lambda: self.check_watching()))  # noqa: PLW0108 - set later
             else:
                 self._hooks.append(CommandHook(hook, device))
         self._tasks: list[asyncio.Task[None]] = []
@@ -78,7 +79,7 @@ class AlarmHooks:
         """Stop setting relays to their level without an alarm until alarms are evaluated again."""
         for hook in self._hooks:
             hook.has_evaluated = False
-        self.is_watching = lambda: False
+        self.check_watching = lambda: False
 
     @property
     def finished_hashes(self) -> list[str]:

@@ -94,7 +94,7 @@ def forecast_data(forecaster: Forecaster, trip: Trip | None) -> dict[str, Any]:
         trip: Expected trip; None: a load like the observed one.
     """
     forecast = forecaster.forecast(trip.load if trip else None)
-    curve = forecaster.trip_curve(trip.load) if trip and trip.has_end else None
+    curve = forecaster.given_load_curve(trip.load) if trip and trip.has_end else None
     return as_json_data(forecast, trip_outcome(trip, curve) if trip and curve else None, forecaster.cutoff_v)
 
 

@@ -96,4 +96,4 @@ def load_forecast_kernels() -> None:
     forecaster = Forecaster(estimator, cutoff_v=cell.cell.voltage_min_v)
     Pack(estimator, forecaster=forecaster).run(samples)
     forecaster.forecast()
-    forecaster.trip_curve(constant_trip("power_w", 1.0, 60.0).load)
+    forecaster.given_load_curve(constant_trip("power_w", 1.0, 60.0).load)

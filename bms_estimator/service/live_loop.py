@@ -83,7 +83,7 @@ LAG_INTERVAL_S = 0.1
 SEND_ITERATIONS = 2
 """Iterations of the event loop that send a published estimate: one takes it from the outbox, one writes it."""
 STATUS_INTERVAL_S = 60.0
-"""Interval between two SOC texts for systemd [s]. The start and end of samples are reported at once."""
+"""Interval between two SOC texts for systemd [s]. It is reported at once when samples begin or cease to arrive."""
 
 log = structlog.get_logger(__name__)
 
@@ -93,7 +93,7 @@ class ServiceParts:
     """Optional parts of a service around its live loop."""
 
     status: ServiceStatus = field(default_factory=ServiceStatus)
-    """State of the service around the pack; the loop adds its own parts."""
+    """State of the service around the pack. The loop adds the state of its own parts."""
     requests: RequestDispatcher | None = None
     """Dispatcher at which the loop registers its handlers."""
     store_current_zero: Callable[[], Awaitable[None]] | None = None
@@ -161,16 +161,20 @@ async def run_estimation_loop(
     )
     monitor = publisher.alarm_monitor
     restore_error = monitor.restore(counters.alarms, crashed=saved_run.crashed)
-    hooks.is_watching = monitor.check_silence
+    hooks.check_watching = monitor.check_silence
     hooks.restore_active(monitor.report, counters.hooks, crashed=saved_run.crashed)
     if lost_reason := saved_run.lost_reason or restore_error:
         # after restore_active, so that the hooks announce this alarm
         monitor.raise_state_lost(lost_reason)
     if parts.board_check:
+        # the values on which the alarms depend may be wrong with another calibration
         parts.board_check.on_recalibrated = monitor.raise_state_lost
-    # a raised alarm or a lost cell keeps the slots of the earlier run, so that a floating input does not replace the cell
+    # while an alarm is raised or a cell is missing, the cells keep their slots of the earlier run, because a floating input
+    # could be taken for the missing cell
     keeps_slots = monitor.alarms.active or monitor.alarms.unwatched_critical
-    slots = CellSlots(model.cell.series_count, counters.cell_slots if keeps_slots else (), counters.cell_slots)
+    slots = CellSlots(
+        model.cell.series_count, slots=counters.cell_slots if keeps_slots else (), earlier=counters.cell_slots
+    )
     if parts.requests is not None:
         RequestHandlers(pack, publisher, parts.store_current_zero).register(parts.requests)
     writer = (
@@ -244,10 +248,10 @@ async def _estimate(
             logged_reason = slots.reason
             if logged_reason:
                 log.warning("no estimates of single cells", reason=logged_reason)
-        if slots.moved:
-            publisher.alarm_monitor.raise_state_lost(slots.moved)
+        if slots.moved_reason:
+            publisher.alarm_monitor.raise_state_lost(slots.moved_reason)
         now_s = since_boot()
-        pack.extend_gap(now_s - before_s)
+        pack.extend_gap(now_s - before_s)  # no effect after the first accepted sample
         before_s = now_s
         if edge:
             edge.take(received.samples, received.cells_v)

@@ -116,15 +116,16 @@ class RelayHook(Hook):
         settings: Settings of the hook.
         board: The board.
         clock: Time since boot of the host [s].
-        is_watching: Returns True once enough samples have arrived to raise all due alarms. Before that, the level without an
-            alarm is not sent, so that a restart or a crash loop connects no load.
+        check_watching: Evaluates the time since the last sample, and returns True once enough samples have arrived to raise
+            all due alarms. Before that, the level without an alarm is not sent, so that a restart or a crash loop connects
+            no load.
     """
 
     def __init__(
-        self, settings: AlarmHook, board: RelayBoard, clock: Callable[[], float], is_watching: Callable[[], bool]
+        self, settings: AlarmHook, board: RelayBoard, clock: Callable[[], float], check_watching: Callable[[], bool]
     ) -> None:
         super().__init__(settings)
-        self._board, self._clock, self._is_watching = board, clock, is_watching
+        self._board, self._clock, self._check_watching = board, clock, check_watching
         self._hold = RelayHold(low_is_safe=settings.relay == "low")
 
     @property
@@ -172,7 +173,7 @@ class RelayHook(Hook):
 
     async def _send_level(self) -> str:
         """Send the level that is allowed now. Return the reason why the board does not confirm it; empty if it does."""
-        self.has_evaluated = self._is_watching() or self.has_evaluated  # first, because it may raise alarms
+        self.has_evaluated = self._check_watching() or self.has_evaluated  # first, because it may raise alarms
         if not (self._raised or self.has_evaluated):
             return ""
         level = self._hold.level(high=self._wants_high, now_s=self._clock())

@@ -53,7 +53,7 @@ class SimulatedNode:
         self._soc, self._capacity_ah = soc, capacity_ah
         self._deviations_v = _cell_deviations(cells, random.Random(seed))
         self.path = f"{prefix}/sensor/+/state on {', '.join(mqtt.urls)}"
-        """Topics and broker, which texts show in place of the path of a port."""
+        """Topics and broker. Messages to the user show them where they show the path of a simulated board's port."""
         self.time_s = 0.0
         """Time of the last reading [s]."""
         self.samples = 0

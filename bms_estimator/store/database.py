@@ -219,7 +219,7 @@ class _File:
         self.close()
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         for suffix in ("", "-wal", "-shm"):
-            self._quarantine_symlink(self._path.with_name(self._path.name + suffix))
+            self._quarantine_non_regular(self._path.with_name(self._path.name + suffix))
         descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         try:
             os.fchmod(descriptor, 0o600)  # SQLite creates its log with the permissions of the database
@@ -239,7 +239,7 @@ class _File:
         connection.execute(f"PRAGMA journal_size_limit = {LOG_BYTES}")
         migrate(connection, self._tables)
 
-    def _quarantine_symlink(self, path: Path) -> None:
+    def _quarantine_non_regular(self, path: Path) -> None:
         """Rename a symlink or any other non-regular file, because SQLite would write to its target."""
         try:
             status = path.lstat()

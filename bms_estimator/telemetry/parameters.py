@@ -136,7 +136,7 @@ def _battery_report(estimator: Estimator, cell: CellModel, now_s: float) -> Para
     for i in range(1, 16):
         observer_value = _with_reason(parameters[f"a{i}"], unlearned_reason[i])
         observer_value = parameters[f"a{i}"] = _mark_source(observer_value, from_data[i], learning)
-        if estimator.identifying and not learning:
+        if estimator.has_filter and not learning:
             parameters[f"a{i}"] = _with_fit_std(observer_value, fitted_parameter(record, i), now_s)
             if i in CAPACITANCE_PARAMETERS:
                 parameters[f"a{i}"] = _with_tau_validity(parameters[f"a{i}"], estimator)
@@ -144,7 +144,7 @@ def _battery_report(estimator: Estimator, cell: CellModel, now_s: float) -> Para
         indices = slice(3 * e + 1, 3 * e + 4)
         reason = next((each for each in unlearned_reason[indices] if each != CONFIGURED_REASON), CONFIGURED_REASON)
         elements[name] = _mark_source(_with_reason(elements[name], reason), from_data[indices].any(), learning)
-    if estimator.identifying:
+    if estimator.has_filter:
         for name, identified in present_elements(record).items():
             elements[name] = _select_parameter(identified, elements[name], VALID_STD, now_s)
         health = _state_of_health(estimator, now_s)
@@ -156,7 +156,7 @@ def _battery_report(estimator: Estimator, cell: CellModel, now_s: float) -> Para
         publish_time=iso_utc(now_s),
         soc=finite(state["soc"]),
         a=_with_units(parameters),
-        ocv=_ocv(estimator) if estimator.identifying else None,
+        ocv=_ocv(estimator) if estimator.has_filter else None,
         elements=elements,
         state_of_health=health,
     )

@@ -24,7 +24,7 @@ def remaining_capacity_ah(estimator: Estimator) -> float:
 
 def full_capacity_ah(estimator: Estimator) -> float:
     """Return the capacity [Ah] that the identifier has learned, after a sample; without an identifier, the declared capacity."""
-    ratio = relative_capacity(estimator.record[0]).value if estimator.identifying else 1.0
+    ratio = relative_capacity(estimator.record[0]).value if estimator.has_filter else 1.0
     return ratio * float(estimator.settings["capacity_as"][0]) / 3600.0
 
 

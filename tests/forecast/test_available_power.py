@@ -36,7 +36,11 @@ def lfp_pack() -> CellModel:
 
 
 def lfp_forecaster(soc: float, seconds: int = 1800, current_a: float = 0.0, **pack: Any) -> Forecaster:
-    """Return a forecaster of a pack with a generic cell file, after ``seconds`` at the OCV of ``soc`` and a load of ten seconds."""
+    """Return a forecaster of a pack with a generic cell file.
+
+    It has processed ``seconds`` at rest at the OCV of ``soc``, and then 10 s with the current, if it is not 0. That is the
+    shorter duration of an available power.
+    """
     settings, cell = Settings.model_validate({"pack": pack}), lfp_pack()
     pack_ = new_pack(settings, cell, has_forecasts=False)
     block = np.zeros(seconds + (10 if current_a else 0), SAMPLE)
@@ -53,8 +57,8 @@ def values(forecaster: Forecaster, names: tuple[str, str]) -> list[float]:
     return [float(forecaster.forecast().values[name][0]) for name in names]
 
 
-def test_a_pack_without_limits_supplies_the_power_of_1_c_and_accepts_that_of_half_of_it() -> None:
-    """The limit of the alarm, 5 C, would give 60 kW."""
+def test_available_power_of_a_pack_without_limits_is_that_of_1_c_and_of_c_2_on_charge() -> None:
+    """The current limit of the alarms, 5 C, would give 60 kW."""
     forecaster = lfp_forecaster(0.5)
     voltage_v = SERIES * 3.2
     assert values(forecaster, DISCHARGE) == pytest.approx([CAPACITY_AH * voltage_v] * 2, rel=0.03)
@@ -82,7 +86,10 @@ def test_given_limits_of_the_current_bound_the_power(limit_a: float) -> None:
     [(0.3, 1, DISCHARGE), (0.46, 1, DISCHARGE), (0.3, 1, CHARGE), (0.7, 1, CHARGE), (0.9, 1800, CHARGE)],
 )
 def test_power_is_unknown_while_the_soc_is_too_uncertain(soc: float, seconds: int, names: tuple[str, str]) -> None:
-    """The quantile alone would be 0 W, although the median is that of the current limit."""
+    """The 5 % quantile would be 0 W, although the median is the power at the current limit.
+
+    A sample at switch-on gives little information on the SOC. At an SOC of 0.9, half an hour at rest does not give enough.
+    """
     assert all(math.isnan(value) for value in values(lfp_forecaster(soc, seconds), names))
 
 

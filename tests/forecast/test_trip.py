@@ -36,7 +36,7 @@ def forecaster() -> Forecaster:
 
 def outcome_of(forecaster: Forecaster, current_a: float, duration_s: float) -> TripOutcome:
     trip = constant_trip("current_a", current_a, duration_s)
-    curve = forecaster.trip_curve(trip.load)
+    curve = forecaster.given_load_curve(trip.load)
     assert curve
     return trip_outcome(trip, curve)
 

@@ -125,7 +125,7 @@ class House:
         hour = (self.hour + (self.time_s - 86_400.0 * self.days) / 3600.0) % 24.0
         if not 8.0 <= hour < 16.0:
             self.charger_a = 70.0
-            return 8.0 + 4.0 * float(np.sin(self.time_s / 3000.0))
+            return 12.0 + 4.0 * float(np.sin(self.time_s / 3000.0))
         return -self.charger_a if self.charger_a > 0.7 * TAIL_A else 0.0
 
 
@@ -143,13 +143,6 @@ async def open_page(browser: Browser, url: str, **options: Any) -> AsyncIterator
         await page_tab.until_status("live")
         await page_tab.until("() => document.querySelectorAll('.curve [aria-label]').length >= 4")
         yield page_tab
-
-
-async def shoot_unknown(folder: Path, browser: Browser) -> None:
-    """Write a screenshot of the first minutes without the SOC of the BMS."""
-    pack = {key: value for key, value in SETTINGS["pack"].items() if key != "device_soc_std"}
-    async with House(0.02, 0.55, 20.0, pack=pack).page(folder) as url, open_page(browser, url) as page_tab:
-        await shoot(page_tab, "unknown", top=True)
 
 
 async def shoot_week(folder: Path, browser: Browser) -> None:
@@ -172,12 +165,17 @@ async def shoot_stale(folder: Path, browser: Browser) -> None:
         await shoot(page_tab, "stale", top=True)
 
 
-async def shoot_alarm(folder: Path, browser: Browser) -> None:
-    """Write a screenshot of a pack with alarms."""
+async def shoot_states(folder: Path, browser: Browser) -> None:
+    """Write screenshots of the first minutes without the SOC of the BMS, and of a pack with alarms."""
     alarms = {"soc_low": {"limit": 0.6, "delay_s": 1}, "cell_imbalance": {"limit_v": 0.002, "delay_s": 1}}
-    async with House(1.0, 0.5, 6.0, alarms=alarms).page(folder) as url, open_page(browser, url) as page_tab:
-        await page_tab.page.locator(".alarm").first.wait_for()
-        await shoot(page_tab, "alarm", top=True)
+    pack = {key: value for key, value in SETTINGS["pack"].items() if key != "device_soc_std"}
+    for name, house in (
+        ("unknown", House(0.02, 0.55, 20.0, pack=pack)),
+        ("alarm", House(1.0, 0.5, 6.0, alarms=alarms)),
+    ):
+        async with house.page(folder) as url, open_page(browser, url) as page_tab:
+            await page_tab.page.locator(".alarm" if name == "alarm" else "#unknownsoc").first.wait_for()
+            await shoot(page_tab, name, top=True)
 
 
 async def shoot_setup(folder: Path, browser: Browser) -> None:
@@ -203,7 +201,7 @@ async def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         async with chromium() as browser:
-            for shots in (shoot_unknown, shoot_week, shoot_stale, shoot_alarm, shoot_setup):
+            for shots in (shoot_states, shoot_week, shoot_stale, shoot_setup):
                 await shots(folder, browser)
 
 

@@ -172,6 +172,15 @@ async def test_page_shows_the_published_values_with_units(browser: Browser, prog
         assert await gain.inner_text() == "Observer, N(k)\n0.97"
         meter = page_tab.page.get_by_role("meter", name="State of charge")
         assert await meter.get_attribute("aria-valuenow") == "43"
+        assert (
+            await page_tab.page.evaluate(
+                """async () => {
+                (await import("./state.js")).drawState({}, { value: 0.967, std: 0.031, valid: false });
+                return document.querySelector("[data-q=capacity_note]").textContent;
+            }"""
+            )
+            == "so far 97 ± 6 %"
+        )
         cell = page_tab.page.get_by_role("img", name="cell 4: 3.269 V, lowest")
         assert await cell.is_visible()
         assert await page_tab.page.get_by_role("img", name="cell 3: not measured").count() == 1
@@ -201,6 +210,10 @@ async def test_the_forecast_is_shown_as_curves_and_with_its_band(browser: Browse
         for chart in ("Voltage, forecast: from 2.700 to 3.800 V", "State of charge, forecast: from 0.000 to 50.000 %"):
             await page_tab.page.get_by_role("img", name=chart).wait_for()
         await page_tab.page.get_by_role("img", name="Load still on, probability, forecast: from 0").wait_for()
+        assert ":" not in await page_tab.page.evaluate(  # two midnights within 36 h
+            """async () => (await import("./forecast.js")).charts.v.plot.axes[0]
+            .values({ scales: { x: { min: 0, max: 130000 } } }, [0, 86400]).join()"""
+        )
         assert page_tab.errors == []
 
 
@@ -402,13 +415,21 @@ async def test_an_alarm_is_shown_while_it_is_raised(browser: Browser, programs: 
         text = await element.inner_text()
         assert "cell voltages are missing" in text
         assert "cannot be watched" in text
-        other = unwatched.model_copy(update={"name": "cell_over_voltage"})
-        await publish(programs.live, "alarm/cell_over_voltage", other.model_dump_json())
+        await publish(
+            programs.live,
+            "alarm/cell_over_voltage",
+            unwatched.model_copy(update={"name": "cell_over_voltage"}).model_dump_json(),
+        )
         rows = page_tab.page.locator(".alarm")
         await rows.get_by_text("cell under voltage, cell over voltage").wait_for()
         assert await rows.count() == 1
-        named = {"name": "sensor_fault", "text": "cell voltages are missing: cell_under_voltage cannot be raised"}
-        await publish(programs.live, "alarm/sensor_fault", alarm.model_copy(update=named).model_dump_json())
+        await publish(
+            programs.live,
+            "alarm/sensor_fault",
+            alarm.model_copy(
+                update={"name": "sensor_fault", "text": "cell voltages are missing: ..."}
+            ).model_dump_json(),
+        )
         await rows.get_by_text("sensor fault").wait_for()
         assert await rows.count() == 1
         for name in ("cell_under_voltage", "cell_over_voltage", "sensor_fault"):

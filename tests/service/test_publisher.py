@@ -48,8 +48,7 @@ def test_a_wrong_chemistry_is_suspected_by_the_soc_of_the_device(chemistry: str,
     now_s, samples, device_soc = 0.0, np.zeros(600, SAMPLE), np.full(600, 0.6)
     pack = new_pack(settings, load_cell(chemistry, 100.0))
     publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[], clock=Clock(monotonic=lambda: now_s))
-    now_s, samples["time_s"], samples["voltage_v"] = 600.0, np.arange(600), 3.3
-    samples["temperature_c"] = 25.0
+    now_s, samples["time_s"], samples["voltage_v"], samples["temperature_c"] = 600.0, np.arange(600), 3.3, 25.0
     publisher.add(ReceivedSamples(samples, NO_CELLS, device_soc=device_soc), pack.run(samples, device_soc=device_soc))
     assert publisher.snapshot.health.suspects == suspects
 

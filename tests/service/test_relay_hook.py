@@ -142,7 +142,7 @@ async def test_only_the_level_in_alarms_is_sent_while_alarms_are_not_watched() -
         await later_command(board)
         hooks.stop_watching()
         polls = list[bool]()
-        hooks.is_watching = lambda: bool(polls.append(False))
+        hooks.check_watching = lambda: bool(polls.append(False))
         await until(lambda: polls)
         commands = board.commands
         await until(lambda: len(polls) > 5)

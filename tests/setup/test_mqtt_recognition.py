@@ -90,7 +90,7 @@ def test_publishers_without_a_current_and_other_messages_are_ignored() -> None:
 
 
 def test_a_publisher_of_changes_is_recognized_by_its_silent_topics() -> None:
-    """A publisher that repeats its values, or publishes most of them, needs no setting."""
+    """A publisher that also sends unchanged values needs no ``max_silent_s``."""
     for payloads, expected in ((("1", "2", "3"), 300.0), (("1", "2", "2"), None)):
         recognition = PublisherRecognition()
         for topic, payload in JK_NODE.items():

@@ -119,7 +119,7 @@ async def test_minutes_repeated_by_a_clock_set_back_are_not_merged(path):
 
 
 async def test_rows_of_longer_steps_aggregate_minutes(path):
-    """Two hours that begin within an hour of the clock are three rows of an hour."""
+    """The two hours of samples begin between full hours, so that they touch three hours of the clock."""
     await record_history(path, [snapshot_at(float(s), s / 60, 3.0, soc=1.0 - s / 7200) for s in range(0, 7200, 10)])
     minutes, [first, second, last] = read_rows(path), read_rows(path, 3600)
     assert len(minutes) == 120
@@ -179,8 +179,8 @@ async def test_rows_wait_in_memory_while_the_disk_fails(path):
     path.mkdir()
     (path / "file").touch()
     async with Database(path, retry_s=0.0) as database, HistorySink(database, days=366) as history:
-        # otherwise the folder at the path would be renamed
-        database._file._quarantine_symlink = leave_in_place  # type: ignore[method-assign]
+        # it renames any file that is not regular, and would therefore also rename the folder at the path
+        database._file._quarantine_non_regular = leave_in_place  # type: ignore[method-assign]
         history.publish(snapshot_at(0.0))
         history.publish(snapshot_at(60.0))
         await until(lambda: database.failure_reason)
@@ -220,8 +220,8 @@ class DatabaseWithLostResults(Database):
 
 
 async def test_rows_of_a_transaction_with_unknown_result_are_not_repeated(path, monkeypatch):
-    monkeypatch.setattr(history_module, "WRITE_S", 0.0)
-    monkeypatch.setattr(history_module, "WRITTEN_ROWS", 2)
+    monkeypatch.setattr(history_module, "WRITE_S", 0.0)  # no pause between two writes
+    monkeypatch.setattr(history_module, "WRITTEN_ROWS", 2)  # a write is due when two minutes wait
     async with DatabaseWithLostResults(path, retry_s=0.0) as database, HistorySink(database, days=366) as history:
         database.remaining = 2
         for second in range(0, 190, 10):

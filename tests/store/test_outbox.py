@@ -260,7 +260,7 @@ async def test_memory_is_bounded_while_the_disk_fails(path):
         path.mkdir()
         (path / "file").touch()
         # otherwise the folder at the path would be renamed
-        database._file._quarantine_symlink = lambda _: None  # type: ignore[method-assign]
+        database._file._quarantine_non_regular = lambda _: None  # type: ignore[method-assign]
         for number in range(3 * MAX_TAIL):
             outbox.put(numbered_message(number))
             if number % 1000 == 0:

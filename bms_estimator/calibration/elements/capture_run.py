@@ -15,9 +15,8 @@ from bms_estimator.model.cell import CellModel
 MIN_SPAN_K = 10.0
 """Minimum temperature difference that gives activation energies and dE/dT [K]."""
 FULL_TOLERANCE_V = 0.03
-"""Maximum distance of the voltage of a first rest from the voltage of a full cell at which the capture counts as starting
-full, per cell [V]. This rule applies only away from 25 C, because cold rests are not relaxed and their voltage gives a
-wrong SOC."""
+"""Tolerance within which the first rest of a capture has the voltage of a full cell, so that the capture starts full, per cell
+[V]. This rule applies only away from 25 C, because cold rests are not relaxed and their voltage gives a wrong SOC."""
 MIN_DEVIATION_K = 5.0
 """Minimum deviation from 25 C at which ``FULL_TOLERANCE_V`` applies [K]."""
 MIN_CELL_C = -45.0
@@ -59,25 +58,25 @@ def make_run(capture: CleanCapture, cell: CellModel, soc: float | None, temperat
     """Return a capture with its SOC by coulomb counting from ``soc``, or from the SOC of its first rest if None."""
     if temperature_c is not None:
         capture = replace(capture, temperature_c=temperature_of(capture, temperature_c))
-    temperature = temperature_of(capture)
+    temperatures_c = temperature_of(capture)
     first_soc = initial_soc(capture, cell) if soc is None else soc
     full_v = ocv_grid(cell)[0][-1]
-    is_far_from_reference = abs(float(temperature[0]) - REFERENCE_C) > MIN_DEVIATION_K
+    is_far_from_reference = abs(float(temperatures_c[0]) - REFERENCE_C) > MIN_DEVIATION_K
     if (
         soc is None
         and is_far_from_reference
         and abs(full_v - capture.start_v) < FULL_TOLERANCE_V * cell.cell.series_count
     ):
         first_soc = 1.0
-    return Run(capture, first_soc - capture.discharged_ah / cell.cell.capacity_ah, temperature)
+    return Run(capture, first_soc - capture.discharged_ah / cell.cell.capacity_ah, temperatures_c)
 
 
 def temperature_contradictions(capture: CleanCapture, temperature_c: float | None) -> list[str]:
     """Return a message if the temperature of a capture is implausible."""
-    temperature = temperature_of(capture, REFERENCE_C if temperature_c is None else temperature_c)
-    if temperature.min() >= MIN_CELL_C and temperature.max() <= MAX_CELL_C:
+    temperatures_c = temperature_of(capture, REFERENCE_C if temperature_c is None else temperature_c)
+    if temperatures_c.min() >= MIN_CELL_C and temperatures_c.max() <= MAX_CELL_C:
         return []
-    measured = f"temperature_c runs from {temperature.min():.1f} to {temperature.max():.1f}"
+    measured = f"temperature_c runs from {temperatures_c.min():.1f} to {temperatures_c.max():.1f}"
     return [f"{capture.name}: {measured}, but cells are between {MIN_CELL_C:g} and {MAX_CELL_C:g} C"]
 
 

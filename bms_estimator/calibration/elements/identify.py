@@ -164,7 +164,7 @@ MISCOUNT_PASSES = 3
 """Number of fits that refine the miscount of each capture. Iteration is needed because the OCV is nonlinear at a
 knee."""
 REGRESSION_WORK = 0.5
-"""Time for the normal equations of a capture, relative to the time for the replays of the capture."""
+"""Computation time of the normal equations of a capture, relative to that of its replays."""
 EQUAL_SCORE_RATIO = 1.05
 """Ratio up to which two scores count as equal. Four replays do not resolve a smaller difference."""
 
@@ -235,7 +235,7 @@ def identify(
 
 
 def _scores(candidate: Candidate, runs: list[Run], work: WorkCounter) -> Floats:
-    """Return the score of each capture's replays [%], by a fit without the capture if it is held back."""
+    """Return the score of each capture's replays [%]. For a capture that is held back, the fit omits this capture."""
     return np.array(
         [
             interval_score(candidate.cell_for(j), run.capture, run.soc, work.part(run.soc.size))

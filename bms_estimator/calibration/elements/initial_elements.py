@@ -37,7 +37,7 @@ class InitialElements:
     """Elements that do not depend on SOC.
 
     Attributes:
-        r_s_ohm: Series resistance, with all dynamics faster than the capture's sampling [ohm].
+        r_s_ohm: Series resistance [ohm]. It includes all dynamics that are faster than the capture's sampling.
         r_ts_ohm: Resistance of the short RC pair [ohm].
         tau_ts_s: Time constant of the short RC pair [s].
         r_tl_ohm: Resistance of the long RC pair [ohm].
@@ -124,7 +124,7 @@ def _elements_from_rest(
 
 
 def _rc_resistance(voltage_v: float, current_a: float, load_s: float, tau_s: float) -> float:
-    """Return the resistance [ohm] of an RC pair that a load of ``load_s`` charged to ``voltage_v``, by (2.2)."""
+    """Return the resistance of an RC pair that a load of duration ``load_s`` has charged to ``voltage_v``, by (2.2) [ohm]."""
     charged_fraction = -float(np.expm1(-load_s / tau_s))
     return max(voltage_v / (current_a * charged_fraction), MIN_OHM)
 

@@ -61,7 +61,7 @@ class LadderFit:
         correction: Coefficients of d, see ``correction_at``.
         per_kelvin_v: u at ``KELVIN_NODES`` [V/K].
         weak_ohm: Shape (RESISTANCES, SOC_NODES.size), part with the weak temperature dependence [ohm].
-        strong_ohm: Shape as of ``weak_ohm``, part with the strong temperature dependence [ohm].
+        strong_ohm: Part with the strong temperature dependence, in the shape of ``weak_ohm`` [ohm].
         covariance: Covariance of the weak and then the strong resistances, each row by row. It neglects the bounds at
             0.
     """
@@ -93,7 +93,7 @@ class Prior:
 
     Attributes:
         ocv_error_v: Std of d at ``EVEN_SOC`` [V]; ``FIXED_OCV_STD_V`` if d is not fitted.
-        per_kelvin_v: Std of u [V/K]; ``FIXED_PER_KELVIN_STD_V`` if u is not fitted.
+        per_kelvin_std_v: Std of u [V/K]; ``FIXED_PER_KELVIN_STD_V`` if u is not fitted.
         scale_ohm: Scale of the resistances [ohm].
         series: Cells in series.
         shapes: Shape (2, RESISTANCES, SOC_NODES.size), typical values of the weak and strong part of each resistance
@@ -103,7 +103,7 @@ class Prior:
     """
 
     ocv_error_v: Floats
-    per_kelvin_v: float
+    per_kelvin_std_v: float
     scale_ohm: float
     series: int
     shapes: Floats
@@ -142,7 +142,7 @@ def _prior_information(prior: Prior) -> Floats:
     bend = np.diff(spline, 2, axis=0) * (EVEN_SOC.size - 1) ** 2 / (BEND_V * prior.series)
     bend[EVEN_SOC[1:-1] < LOW_BEND_SOC] /= LOW_BEND_FACTOR
     table[:SPLINES, :SPLINES] = deviation.T @ deviation + bend.T @ bend / OCV_INTERVALS
-    table[SPLINES:UNBOUNDED, SPLINES:UNBOUNDED] = np.eye(KELVIN_NODES.size) / prior.per_kelvin_v**2
+    table[SPLINES:UNBOUNDED, SPLINES:UNBOUNDED] = np.eye(KELVIN_NODES.size) / prior.per_kelvin_std_v**2
     for first, shape in zip((UNBOUNDED, UNBOUNDED + PART_SIZE), prior.shapes, strict=True):
         roughness = _roughness_rows() / (ROUGHNESS_STD * prior.scale_ohm) / shape.ravel()
         part = roughness.T @ roughness + LEVEL_PRECISION * np.eye(PART_SIZE) / prior.scale_ohm**2

@@ -40,10 +40,10 @@ def ladder_prior(cell: CellModel, scale_ohm: float, *, refine_ocv: bool, spans_t
     """
     series, given = cell.cell.series_count, cell.ladder
     measured = isinstance(cell.ocv, TableOcv) and cell.ocv.per_kelvin_v is not None
-    entropy_v = MEASURED_PER_KELVIN_STD_V if measured else PER_KELVIN_STD_V
+    per_kelvin_std_v = MEASURED_PER_KELVIN_STD_V if measured else PER_KELVIN_STD_V
     return Prior(
         ocv_error_v=_curve_error(cell) if refine_ocv else np.full(EVEN_SOC.size, FIXED_OCV_STD_V),
-        per_kelvin_v=(entropy_v if spans_temperature and refine_ocv else FIXED_PER_KELVIN_STD_V) * series,
+        per_kelvin_std_v=(per_kelvin_std_v if spans_temperature and refine_ocv else FIXED_PER_KELVIN_STD_V) * series,
         scale_ohm=scale_ohm,
         series=series,
         shapes=_shapes(cell, scale_ohm),

@@ -1,10 +1,10 @@
 """Normal equations of the ladder fit over one capture.
 
-The weight of a capture does not depend on its number of rows. The weight of a row is the time since the previous row,
-divided by the time since the last change of current, so that each decade of time in a rest has equal weight. The ends
-of long rests have additional weight: together as much as all other rows. Each capture counts as ``ROWS_PER_CAPTURE``
-rows. Large voltage drops have an error relative to their size. All constants of this module were chosen by the score of
-replays on drive cycles that were not part of the fit.
+Each capture counts as ``ROWS_PER_CAPTURE`` rows, whatever its number of rows. The weight of a row is the time since the
+previous row, divided by the time since the last change of current, so that each decade of time in a rest has equal weight. The
+ends of long rests have additional weight, together as much as all other rows. The error of a row is relative to its voltage
+drop if that is large. All constants of this module were chosen by the score of replays on drive cycles that were not part of
+the fit.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ ERROR_V = 4e-3
 ERROR_J = 22e3
 """Activation energy of the growth of ``ERROR_V`` in the cold [J/mol]."""
 SOC_STD = 0.01
-"""Std of the SOC after a change of 1. The variance grows with the change: at a knee far from the start a cell deviates
-from its curve, and this voltage error must not appear as a resistance."""
+"""Std of the SOC after the SOC has changed by 1. The variance is proportional to the change, because at a knee far from the
+start a cell deviates from its curve. This voltage error must not appear as a resistance."""
 RELATIVE_STD = 0.1
 """Std of a row relative to its voltage drop. The drop is the largest of the currents x_0 to x_3 times the scale of the
 resistances."""
@@ -72,9 +72,9 @@ class NormalEquations:
     Attributes:
         information: X'WX with the miscount of the charge marginalized.
         information_vector: X'Wy with the miscount marginalized.
-        miscount_cross: X'Wc, where c is the voltage change by a miscount of 1.
+        miscount_cross: X'Wc, where c is the voltage change due to a miscount of 1.
         miscount_information: c'Wc plus the inverse prior variance of the miscount.
-        miscount_vector: c'Wy plus the part of the miscount's prior.
+        miscount_vector: c'Wy plus the term of the miscount's prior.
     """
 
     information: Floats
@@ -142,10 +142,11 @@ def normal_equations(
         jump -= model_rows(soc[is_before_step], temperature_c[is_before_step], currents[is_before_step])
         rows = np.vstack([rows, jump * step_root_weight[:, None]])
         target = np.r_[target, (residual_v[is_after_step] - residual_v[is_before_step]) * step_root_weight]
-    by_miscount = np.zeros(target.size)  # weighted voltage change by a relative miscount of 1; 0 for jumps
-    by_miscount[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * root_weight
-    miscount_cross, miscount_information = rows.T @ by_miscount, float(by_miscount @ by_miscount + 1.0 / COUNT_STD**2)
-    miscount_vector = float(by_miscount @ target - miscount / COUNT_STD**2)
+    miscount_column = np.zeros(target.size)  # weighted voltage change due to a miscount of 1; 0 for jumps
+    miscount_column[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * root_weight
+    miscount_cross = rows.T @ miscount_column
+    miscount_information = float(miscount_column @ miscount_column + 1.0 / COUNT_STD**2)
+    miscount_vector = float(miscount_column @ target - miscount / COUNT_STD**2)
     return NormalEquations(
         information=rows.T @ rows - np.outer(miscount_cross, miscount_cross) / miscount_information,
         information_vector=rows.T @ target - miscount_cross * miscount_vector / miscount_information,
@@ -166,9 +167,8 @@ def _weights(capture: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
     largest_a = float(np.abs(capture.current_a).max())
     step_s = np.clip(np.diff(capture.time_s, append=capture.time_s[-1] + 1.0), 0.0, MAX_ROW_S)
     changed = np.r_[True, np.abs(np.diff(capture.current_a)) > STEP_FRACTION * largest_a]
-    # time since the last change: each sample less the latest changed one
-    since_s = capture.time_s - capture.time_s[np.maximum.accumulate(np.where(changed, np.arange(changed.size), 0))]
-    weight = step_s / np.maximum(since_s + step_s, MIN_SINCE_STEP_S)
+    last_change = np.maximum.accumulate(np.where(changed, np.arange(changed.size), 0))
+    weight = step_s / np.maximum(capture.time_s - capture.time_s[last_change] + step_s, MIN_SINCE_STEP_S)
     weight /= weight.sum()
     resting = np.abs(capture.current_a) < REST_FRACTION * largest_a
     ends = [

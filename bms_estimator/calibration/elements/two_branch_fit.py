@@ -39,8 +39,10 @@ def cell_file_sections(ladder: Ladder) -> dict[str, Resistance | Capacitance]:
         ohm = np.maximum(total_ohm[:, first_index:end_index].sum(axis=1), MIN_FRACTION * total_ohm.sum(axis=1))
         amplitude, exponent, offset = _exponential(ohm, 1.0)
         sections[name] = Resistance(amplitude_ohm=amplitude, exponent=exponent, offset_ohm=offset)
-        if name != "r_s":  # the time constant of the RC pair is the mean over the ladder, of ln tau
-            # the lower limit gives equal fractions where all resistances are 0
+        if (
+            name != "r_s"
+        ):  # ln tau of the RC pair is the mean of ln tau of its ladder's RC pairs, weighted by resistance
+            # the lower limit gives equal weights where all resistances are 0
             fraction = np.maximum(total_ohm[:, first_index:end_index], 1e-6 * total_ohm.sum(axis=1, keepdims=True))
             fraction /= fraction.sum(axis=1, keepdims=True)
             farad = np.exp(fraction @ LN_TAUS[first_index - 1 : end_index - 1]) / ohm

@@ -75,7 +75,7 @@ def convert(
     out: Annotated[
         Path,
         typer.Option(
-            help=f"file to write, its suffix gives the format: {SUFFIXES_HELP}",
+            help=f"file to write; its suffix determines the format: {SUFFIXES_HELP}",
             show_default=False,
         ),
     ],

@@ -107,8 +107,8 @@ def replay(
 ) -> None:
     """Run the live service's estimator over a capture.
 
-    For a file of `run --record`, the estimates are bit-identical with those of the recorded run, if it began without a
-    checkpoint and no fit was late.
+    For a file of `run --record`, the estimates are bit-identical with those of the recorded run, if the run began without
+    a checkpoint and each fit was finished in time (docs/pack/checkpoints.md).
     """
     settings, model = pack_or_cell(pack, cell, capacity_ah)
     if soc is not None:

@@ -146,7 +146,7 @@ class Summary:
         record, settings = estimator.record[0], estimator.settings_record[0]
         observer = record["observer"]
         counters = sample_counters(observer)
-        identified = estimator.identifying and bool(observer["started"])
+        identified = estimator.has_filter and bool(observer["started"])
         declared_ah = float(estimator.settings["capacity_as"][0]) / 3600.0
         capacity = relative_capacity(record) if identified else None
         return ReplayResult(

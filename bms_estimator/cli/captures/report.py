@@ -147,7 +147,7 @@ def report(
     captures: Annotated[
         list[Path] | None,
         typer.Argument(
-            help=f"captures, each a {CAPTURE_FORMATS}; default: the stored history of --pack", show_default=False
+            help=f"captures, each {CAPTURE_FORMATS}; default: the stored history of --pack", show_default=False
         ),
     ] = None,
     cell: Annotated[str | None, typer.Option(help=CELL_HELP, show_default=False)] = None,

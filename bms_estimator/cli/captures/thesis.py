@@ -42,7 +42,7 @@ COLUMN_TITLE_WIDTH = 12
 def thesis(
     captures: Annotated[
         list[Path] | None,
-        typer.Argument(help=f"captures for chapter 5, each a {CAPTURE_FORMATS}; default: a simulated 6S pack"),
+        typer.Argument(help=f"captures for chapter 5, each {CAPTURE_FORMATS}; default: a simulated 6S pack"),
     ] = None,
     cell: Annotated[
         str | None,

@@ -50,7 +50,10 @@ class AccuracyResult:
 def accuracy(
     pack: Annotated[
         Path | None,
-        typer.Option(help="settings file of the pack: use and full charges come from its history", show_default=False),
+        typer.Option(
+            help="settings file of the pack; its history shows in which range and with how many full charges it is used",
+            show_default=False,
+        ),
     ] = None,
     cell: Annotated[
         str | None, typer.Option(help=CELL_HELP, autocompletion=complete_battery, show_default=False)
@@ -60,7 +63,7 @@ def accuracy(
         tuple[float, float] | None,
         typer.Option(
             metavar="LOW HIGH",
-            help="lowest and highest SOC of the use [%]; 100 as HIGH: the pack is fully charged; default: those of the history",
+            help="range of SOC in which the pack is used [%]; HIGH = 100 means with full charges; default: the range in the history",
             show_default=False,
         ),
     ] = None,
@@ -68,8 +71,8 @@ def accuracy(
 ) -> None:
     """Compute how accurately the SOC of a pack can be estimated, and which change of its use or equipment helps most.
 
-    The result is a lower bound: the std that remains however long the estimator runs, if it knows only the cell file.
-    On average over the cells that the file describes, no estimator has a smaller error.
+    The result is a lower bound. No estimator that knows only the cell file has a smaller RMS error, however long it runs,
+    averaged over the cells that the file describes.
     With --cell, a pack without a temperature sensor is assumed.
     """
     if pack is None and between is None:

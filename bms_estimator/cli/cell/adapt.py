@@ -49,7 +49,8 @@ def adapt_command(
     Equation (4.2) computes the series resistance R_s from all captures; a13..a15 are its coefficients.
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
-    Replays of the captures give both cell files a score for SOC error and width of the SOC interval (docs/cell/identify.md).
+    Both cell files get a score from replays of the captures: it contains the SOC error and the width of the SOC interval
+    (docs/cell/identify.md).
     The new file is written only if its score is at most 5 % above the score of --cell.
     """
     check_output_file(out, captures, force=force)

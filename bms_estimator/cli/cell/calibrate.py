@@ -140,8 +140,9 @@ def calibrate_command(
     inputs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="[PACK.toml] CAPTURE...",
-            help=f"settings file of the pack; captures of the pack, each a {CAPTURE_FORMATS}; or OCV curves (CSV)",
+            metavar="FILE",
+            help=f"captures, each {CAPTURE_FORMATS}; OCV curves (CSV) are also accepted. The first FILE may be the settings file of the "
+            "measured pack, PACK.toml",
             show_default=False,
         ),
     ],
@@ -163,8 +164,8 @@ def calibrate_command(
         float | None,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="SOC 0..1 at the start of the captures that start at the highest voltage; default: 1 if their first rest shows "
-            "a full cell, otherwise from the voltage of that rest",
+            help="initial SOC, 0..1, of the captures that start at the highest voltage; default: 1 if their first rest shows a full "
+            "cell, otherwise read from the voltage of this rest",
             show_default=False,
         ),
     ] = None,

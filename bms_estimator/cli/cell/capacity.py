@@ -66,7 +66,7 @@ class CapacityResult:
 def capacity(
     captures: Annotated[
         list[Path],
-        typer.Argument(help=f"captures of one cell, with rests; each a {CAPTURE_FORMATS}", show_default=False),
+        typer.Argument(help=f"captures of one cell, with rests; each {CAPTURE_FORMATS}", show_default=False),
     ],
     cell: Annotated[
         str,

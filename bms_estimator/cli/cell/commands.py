@@ -56,7 +56,7 @@ FORMATS_HELP = ", ".join(f"{suffix} ({cell_format.name})" for suffix, cell_forma
 def convert(
     cell: Annotated[str, typer.Argument(help=CELL_HELP, show_default=False)],
     out: Annotated[
-        Path, typer.Option(help=f"file to write, its suffix gives the format: {FORMATS_HELP}", show_default=False)
+        Path, typer.Option(help=f"file to write; its suffix determines the format: {FORMATS_HELP}", show_default=False)
     ],
     capacity_ah: CapacityAh = None,
     force: Force = False,

@@ -65,7 +65,8 @@ def identify_command(
     Captures at several temperatures are fitted jointly. Loads with steps and rests over the whole SOC range are best.
 
     Run `ocv` first, and give its cell file, which contains the OCV, as --cell.
-    Replays of the captures give both cell files a score for SOC error and width of the SOC interval (docs/cell/identify.md).
+    Both cell files get a score from replays of the captures: it contains the SOC error and the width of the SOC interval
+    (docs/cell/identify.md).
     The new file is written only if its score is at most 5 % above the score of --cell.
 
     For a fuel cell, give polarization curves (columns current_a, voltage_v) and captures under load

@@ -94,7 +94,7 @@ def ocv(
     captures: Annotated[
         list[Path],
         typer.Argument(
-            help=f"captures with rests or slow discharges and charges, each a {CAPTURE_FORMATS}; or OCV curves (CSV)",
+            help=f"captures with rests or slow discharges and charges, each {CAPTURE_FORMATS}; or OCV curves (CSV)",
             show_default=False,
         ),
     ],
@@ -117,7 +117,7 @@ def ocv(
         float | None,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="SOC 0..1 at the start of the captures that start at the highest voltage; the initial SOC of other captures is read "
+            help="initial SOC, 0..1, of the captures that start at the highest voltage; the SOC of other captures is read "
             "from the OCV curve; default: 1 if the highest voltage is that of a full cell",
             show_default=False,
         ),

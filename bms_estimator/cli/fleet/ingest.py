@@ -31,7 +31,7 @@ def ingest(
         list[Path] | None,
         typer.Option(
             metavar="PATH",
-            help="Parquet file, or folder of such files, with the history of packs: send it and end; may be given several times",
+            help="Parquet file, or folder of such files, with the history of packs; the command sends it and ends; may be given several times",
             show_default=False,
         ),
     ] = None,

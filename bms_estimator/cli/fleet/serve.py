@@ -116,7 +116,7 @@ def users(
     folder: Folder = None,
     days: ValidDays = None,
 ) -> None:
-    """Write the tokens of the edges of all packs of a table, as `fleet user` prints them one by one."""
+    """Write the tokens of the edges of all packs in a table. `fleet user` prints a single token."""
     packs = read_table(table).packs
     credentials.write_tokens(out, _edge_tokens(tenant, packs, settings_file, folder, days))
     typer.echo(f"{out}: {count_text(len(packs), 'token')} written; keep them secret")

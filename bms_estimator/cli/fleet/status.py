@@ -29,7 +29,7 @@ def status(
         int | None,
         typer.Option(
             min=1,
-            help="end with exit code 1 unless every worker reads this version of blocks; check it before an upgrade of edges",
+            help="version of blocks; end with exit code 1 if a worker does not read it. Check this before you upgrade edges",
             show_default=False,
         ),
     ] = None,

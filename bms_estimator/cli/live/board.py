@@ -81,7 +81,7 @@ def board(
     accept: Annotated[
         Path | None,
         typer.Option(
-            help="settings file of a pack, whose service is to accept the next board that connects, for example a replacement; opens no port",
+            help="accept the next board that connects to the service of this pack (settings file), for example a replacement; opens no port",
             show_default=False,
         ),
     ] = None,

@@ -46,5 +46,5 @@ def dashboard(
     page = page_settings(settings.page or PageSettings(), listen=listen, token_file=token_file)
     configure_logs()
     with flush_logs():
-        packs = broker_page(broker, page, folder or state_folder(settings))
-        asyncio.run(serve(packs, "live page", browser=browser))
+        live_page = broker_page(broker, page, folder or state_folder(settings))
+        asyncio.run(serve(live_page, "live page", browser=browser))

@@ -45,7 +45,7 @@ def demo(
         bool,
         typer.Option(
             "--thesis",
-            help="run the method of the thesis alone: counted SOC, a1 to a12 by (3.18), R_s by (4.2), without the identifier",
+            help="run only the method of the thesis, without the identifier: SOC by coulomb counting, a1 to a12 by (3.18), R_s by (4.2)",
         ),
     ] = False,
     browser: Annotated[
@@ -56,7 +56,8 @@ def demo(
 
     The simulated board measures a simulated 275 mAh cell under a changing load.
     The service reads the board through a pseudo-terminal, and publishes to the broker on the loopback interface.
-    The initial SOC is 20 % wrong, or with --thesis the true one. The true SOC is shown beside the estimate.
+    The estimator starts with an SOC that is 20 % too low; with --thesis it starts with the true SOC. The true SOC is shown
+    beside the estimate.
     """
     log = deque[str](maxlen=LOG_LINES)
     configure_logs(log if sys.stdout.isatty() else None)

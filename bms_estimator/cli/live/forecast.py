@@ -15,7 +15,7 @@ from rich.table import Table
 from bms_estimator.checkpoint.state_files import SavedPack, StateFiles
 from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses
 from bms_estimator.cli.options.capture_options import (
-    CAPTURE_HELP,
+    CAPTURE_FORMATS,
     CELL_HELP,
     AsJson,
     CapacityAh,
@@ -87,15 +87,14 @@ def forecast(
         float | None,
         typer.Option(
             parser=decimal(),
-            help="voltage of the pack at which the load is switched off [V]; default: pack.cutoff_v of the settings",
+            help="voltage of the pack at which the load is switched off [V]; default: pack.cutoff_v of the settings, "
+            "otherwise pack.cutoff_voltage_v",
             show_default=False,
         ),
     ] = None,
     capture: Annotated[
         Path | None,
-        typer.Option(
-            help=f"forecast from the end of this {CAPTURE_HELP.removeprefix('capture to read: ')}", show_default=False
-        ),
+        typer.Option(help=f"capture from whose end to forecast: {CAPTURE_FORMATS}", show_default=False),
     ] = None,
     cell: Annotated[
         str | None,
@@ -138,7 +137,7 @@ def forecast(
     if forecaster is None:
         raise UserError(f"{model.cell.name}: a forecast needs a battery, and identifier.enabled = true in the settings")
     result = forecaster.forecast(trip.load if trip else None)
-    curve = forecaster.trip_curve(trip.load) if trip and trip.has_end else None
+    curve = forecaster.given_load_curve(trip.load) if trip and trip.has_end else None
     outcome = trip_outcome(trip, curve) if trip and curve else None
     if plot is not None:
         _write_plot(plot, start.name, curve or result.curve, forecaster.cutoff_v)

@@ -21,7 +21,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="print the result as one JS
 CELL_HELP = "generic cell (lfp, nmc, nca, lco, lmo, lto), name of a shipped cell, or path of a cell file"
 CELL_OR_FUEL_CELL_HELP = f"{CELL_HELP}; for a fuel cell: pem_30w or path of a fuel-cell file"
 CAPTURE_FORMATS = (
-    "file of `record` or `run --record`, a table (CSV, Parquet, spreadsheet), the export of a cycler, "
+    "a file of `record` or `run --record`, a table (CSV, Parquet, spreadsheet), the export of a cycler, "
     "or - for standard input"
 )
 """Formats of a capture in help texts."""
@@ -48,7 +48,7 @@ CapacityAh = Annotated[
     ),
 ]
 CapturesFromRest = Annotated[
-    list[Path], typer.Argument(help=f"captures that begin with a rest; each a {CAPTURE_FORMATS}", show_default=False)
+    list[Path], typer.Argument(help=f"captures that begin with a rest: {CAPTURE_FORMATS}", show_default=False)
 ]
 InitialSoc = Annotated[
     float | None,
@@ -70,7 +70,7 @@ SignOfCurrent = Annotated[
     typer.Option(
         metavar="SIGN",
         help="direction of positive current in the capture: discharge_positive or charge_positive; default: "
-        "as the file format defines it, otherwise as the voltage shows it",
+        "that of the file format, otherwise detected from the voltage",
     ),
 ]
 TemperatureWithoutSensor = Annotated[
@@ -94,9 +94,9 @@ MappedColumns = Annotated[
         "--map",
         parser=parse_column_map,
         metavar="time=COLUMN,...",
-        help="columns of a table, or entities of a Home Assistant export, that contain time, current, voltage and temperature; "
-        "a unit may follow a name, as in 'time=Time \\[ms]'; sheet=SHEET chooses a sheet of a spreadsheet, and instance=NUMBER one of "
-        "several batteries",
+        help="names of the columns with time, current, voltage and temperature, as in 'time=Time \\[ms],current=I'; a unit may "
+        "follow in brackets. In a Home Assistant export they are entities. sheet=SHEET selects a sheet of a spreadsheet. "
+        "instance=NUMBER selects one of several batteries",
         show_default=False,
     ),
 ]

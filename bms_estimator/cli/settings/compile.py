@@ -11,7 +11,7 @@ from bms_estimator.service.kernel_compilation import COMPLETE_FILE
 def compile_command() -> None:
     """Compile the kernels before the first start.
 
-    They are stored in $NUMBA_CACHE_DIR, or else in your cache folder. The service uses
+    The compiled kernels are stored in $NUMBA_CACHE_DIR, or without this variable in your cache folder. The service uses
     /var/cache/bms-estimator. Debian package and Docker images are built with kernels in the folder `compiled` of the program.
     """
     if CACHE_FOLDER is None:

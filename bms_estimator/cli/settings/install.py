@@ -19,7 +19,7 @@ from bms_estimator.installation.install import (
     uninstall,
 )
 from bms_estimator.installation.machine import Machine
-from bms_estimator.installation.pack_files import is_hidden, named_files
+from bms_estimator.installation.pack_files import is_hidden_from_services, named_files
 from bms_estimator.installation.program_copy import copy_program, is_program_copy, system_python
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import load_settings
@@ -50,7 +50,8 @@ def install_command(
     """Install the service, or upgrade it: user, settings, systemd units and udev rule. Requires root.
 
     An upgrade keeps settings and state. A program in a home folder is copied to /opt/bms-estimator, because services
-    have no access to home folders. To upgrade the copy, run `install` of the program in the home folder again.
+    have no access to home folders. To upgrade the copy, run the `install` command again from the
+    program in the home folder.
     """
     machine = _machine(root, "install", [str(pack.resolve())] if pack else [])
     files = _check(pack) if pack else None
@@ -108,7 +109,9 @@ def _errors_of_files() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise UserError(f"{error.filename}: cannot be changed: {error.strerror}; then repeat the command") from None
+        raise UserError(
+            f"{error.filename}: cannot be changed: {error.strerror}; remove the cause and repeat the command"
+        ) from None
 
 
 def _machine(root: Path, command: str, arguments: Sequence[str]) -> Machine:
@@ -146,7 +149,7 @@ def _program(machine: Machine) -> Path:
         UserError: The program is in a home folder, and cannot be copied.
     """
     program = _own_path()
-    if not is_hidden(program):
+    if not is_hidden_from_services(program):
         if program.is_relative_to(paths.PROGRAM_COPY) and is_program_copy(machine.path(paths.PROGRAM_COPY)):
             typer.echo(
                 f"{program} is a copy of version {__version__}, which does not upgrade itself; "

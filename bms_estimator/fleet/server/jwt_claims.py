@@ -79,8 +79,8 @@ _WORKER_PUBLISH = (
     "dead.*.*",
     "table.*",
     "history.*",
-    "fits.*",
-    "fit.*",
+    "fits.*",  # requests for fits
+    "fit.*",  # results of fits
     "fleet.>",
     "_INBOX.>",
 )

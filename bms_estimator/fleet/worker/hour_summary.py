@@ -190,7 +190,7 @@ def _filter_values(estimator: Estimator) -> dict[str, object]:
     """Return the filter's values; empty without a filter and before its first sample."""
     record, settings = estimator.record[0], estimator.settings_record[0]
     filter_state = record["filter"]
-    if not (estimator.identifying and filter_state["started"]):
+    if not (estimator.has_filter and filter_state["started"]):
         return {}
     capacity, offset, r_s = (
         relative_capacity(record),

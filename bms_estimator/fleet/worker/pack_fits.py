@@ -29,11 +29,13 @@ from bms_estimator.pack_model.slow_fit import ADOPT_DELAY_S, fit_interval
 MAX_CACHED_CURVES = 4096
 """Maximum number of packs of a partition whose curves are cached [13 kB each]. Other curves are computed with each block."""
 FULL_ROWS = MAX_ROWS - MIN_FREE_ROWS
-"""Number of completed rows at which the kernel returns, so that they are taken."""
+"""Number of completed rows at which the kernel returns early, so that its caller can take them."""
 
 
 class PackFits:
     """Fits of the pack whose record is loaded.
+
+    An event, at ``event_s`` of the history, is the request for a fit or the adoption of its result.
 
     Args:
         record: Unpacked record of the partition, shape (1,), dtype ``PACK_STATE``.
@@ -130,8 +132,11 @@ class PackFits:
         if fit["received"]["sequence"]:
             self._adopt(slow_fit)
             fit["request"], fit["received"] = 0, np.zeros((), PACK_FIT)
+            # an interval after the request, summed in the order of SlowFit, so that both schedule an equal number
             slow_fit.estimator.schedule(due_s + (slow_fit.interval() - ADOPT_DELAY_S))
-        elif fit["request"] and history["event_s"] == due_s:
+        elif (
+            fit["request"] and history["event_s"] == due_s
+        ):  # the adoption was scheduled with this sum, so that it is equal
             self._counters["late_fits"] += 1
             slow_fit.estimator.schedule(due_s + slow_fit.interval())
         else:
@@ -175,7 +180,7 @@ def write_fit(record: np.void, result: FitResult, sequence: int) -> None:
 
 
 def write_weakest(record: np.void, result: FitResult) -> None:
-    """Write the weakest cell of a bank to a record of dtype ``FIT``. The cell of an exchanged bank is dropped."""
+    """Write the weakest cell of a bank to a record of dtype ``FIT``. If the bank was exchanged, the stored cell is dropped."""
     if result.weakest is not None:
         record["has_weakest"] = 1
         for name, value in vars(result.weakest).items():

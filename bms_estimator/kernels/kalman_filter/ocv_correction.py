@@ -1,16 +1,17 @@
 """Correction of the cell file's OCV curve, learned by the filter as states at SOC nodes.
 
-The part ``constant_error_v`` of the curve's error recurs at each pass of an SOC. It is interpolated between ``NODES`` states,
-scaled so that the variance between nodes equals that at nodes. The states are in units of its std and are correlated over
-``CORRELATION_SOC``. With a plateau they are correlated over the whole curve, so that only its level is learned. The remaining
-error, CURVE, varies with temperature, load and history.
+One part of the curve's error, ``constant_error_v``, is the same each time the pack passes an SOC. It is interpolated between
+``NODES`` states, scaled so that the variance between nodes equals that at nodes. The states are in units of its std and are
+correlated over ``CORRELATION_SOC``. With a plateau they are correlated over the whole curve, so that only its level is learned.
+The remaining error, CURVE, varies with temperature, load and history.
 
 A voltage depends on SOC and curve together, so that its information on the curve is limited by the uncertainty of the SOC.
 The joint covariance contains this limit, so that no rule has to select voltages for learning (as in simultaneous
 localization and mapping: Smith, Self and Cheeseman 1990).
 
-The nodes are learned in the first pass of the curve (``Noise.learning_soc``). Then they return to their prior, and their gain
-is 0: their error counts in the std, but voltages do not change them (Schmidt-Kalman filter).
+The nodes are learned in the first pass of the curve (``Noise.learning_soc``), because in a second pass the filter would take
+the same errors for new information. Then they return to their prior, because their learned values have common errors with the
+SOC of that pass. Their gain is 0: their error counts in the std, but voltages do not change them (Schmidt-Kalman filter).
 
 ``x`` is a mean of EKF_STATE, ``p`` a record of EKF_SETTINGS.
 """

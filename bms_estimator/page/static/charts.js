@@ -44,7 +44,7 @@ export const nulls = (time) => new Array(time.length).fill(null);
 const DAY_S = 86400, STEPS_S = [1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 3600, 7200, 14400, 21600, DAY_S, 2 * DAY_S, 5 * DAY_S, 10 * DAY_S];
 function timeLabels(plot, splits) {
 	const span = plot.scales.x.max - plot.scales.x.min;
-	const text = span > 2 * DAY_S ? dayMonth : span > 600 ? hourMinute : clock;
+	const text = span > 2 * DAY_S || splits[1] - splits[0] >= DAY_S ? dayMonth : span > 600 ? hourMinute : clock;
 	return splits.map((s) => text(new Date(1e3 * s)));
 }
 

@@ -23,8 +23,9 @@ function timeLeft(s) {
 
 /** Capacity of new, or that it is not known yet. */
 function capacityHealth(capacity) {
-	if (!capacity?.valid) return ["not known yet", "after two full charges"];
-	return [`${f.percent(capacity.value, 0)} % of new`, `± ${f.percent(2 * capacity.std, 0)} %`];
+	const band = `± ${f.percent(2 * capacity?.std, 0)} %`;
+	if (capacity?.valid) return [`${f.percent(capacity.value, 0)} % of new`, band];
+	return ["not known yet", capacity?.std < 0.05 ? `so far ${f.percent(capacity.value, 0)} ${band}` : "after two full charges"];
 }
 
 export function drawState(state, capacity) {

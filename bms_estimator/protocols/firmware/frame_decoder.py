@@ -38,7 +38,7 @@ class FrameFault(Enum):
     """Fault of the line as a whole; the value is its text."""
 
     WRONG_BAUD = "bytes come, but no valid frame among them: wrong baud rate?"
-    TEXT = "the board prints text, not frames: sensor.protocol should be text, --text without a settings file"
+    TEXT = 'the board prints text, not frames: set sensor.protocol = "text"; without a settings file, use --text'
     NEWER_PROTOCOL = "the board uses another version of the protocol: update this program or the firmware"
     NO_HELLO = "frames arrive, but the board has not sent its scaling yet"
 
@@ -49,7 +49,7 @@ class FrameCounters:
 
     bytes_received: int = 0
     frames_received: int = 0
-    """Decoded samples."""
+    """Decoded samples; frames of other types do not count."""
     frames_lost: int = 0
     """Frames missing in the sequence, for any reason."""
     crc_errors: int = 0
@@ -70,8 +70,8 @@ class FrameCounters:
     clock_jumps: int = 0
     """Number of restarts of the board's clock from the arrival time.
 
-    A restart follows a sample that arrived long before its timestamp, or whose timestamp advanced more than arrival time,
-    sequence numbers or a gap explain.
+    The clock is restarted if a sample arrives long before its timestamp, or if its timestamp has advanced by more than the
+    arrival time, the sequence numbers and a known gap allow.
     """
 
     def as_dict(self) -> dict[str, int]:
@@ -243,7 +243,11 @@ class FrameDecoder:
         return decode(data, position, ends, arrivals_s, self._state, self._scaling, out, self._messages)
 
     def _store_message(self, packet: NDArray[np.uint8]) -> None:
-        """Decode and store a hello or an acknowledgment: version, type and body, padded with zeros."""
+        """Decode and store a hello or an acknowledgment.
+
+        Args:
+            packet: Version, type and body, padded with zeros.
+        """
         message_type, ack_result = packet[1], packet[3]
         if message_type == MessageType.HELLO:
             hello = Hello.decode(packet[: 2 + Hello.LAYOUT.size].tobytes())
@@ -258,7 +262,8 @@ class FrameDecoder:
 def _is_other_boot(previous: Hello, hello: Hello) -> bool:
     """Return True if the board was reset or exchanged between two hellos."""
     is_same_board = (hello.boot_id, hello.serial) == (previous.boot_id, previous.serial)
-    has_restarted = (hello.sequence - previous.sequence) % MODULUS >= MODULUS // 2  # two boards may have equal boot ids
+    # a lower sequence number also shows a restart, because two boards may have equal boot ids, and no serial number
+    has_restarted = (hello.sequence - previous.sequence) % MODULUS >= MODULUS // 2
     return not is_same_board or has_restarted
 
 

@@ -93,15 +93,15 @@ def discovery(
     }
     if info.board.get("serial"):
         device["serial_number"] = info.board["serial"]
-    fresh_s = FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)
-    expiry_s = max(MIN_EXPIRY_S, math.ceil(fresh_s))
+    expiry_s = max(MIN_EXPIRY_S, math.ceil(FRESH_PERIODS * max(1.0 / info.publish_rate_hz, sample_period_s)))
     sensors = entities(info, inputs.cells).items()
-    positive = {"positive": settings.current_sign.removesuffix("_positive")}
-    templates = {"soc_percent": _SOC_HINT} | {key: _constant(positive) for key, entity in sensors if entity.signed}
+    positive = _constant({"positive": settings.current_sign.removesuffix("_positive")})
+    templates = {"soc_percent": _SOC_HINT} | {key: positive for key, entity in sensors if entity.signed}
     for direction, limit_a in (("discharge", info.max_discharge_a), ("charge", info.max_charge_a)):
-        assumed = {"hint": f"current limit assumed: max_{direction}_a is not in [pack]"}
-        keys = (f"available_{direction}_power_{duration}_w" for duration in ("10s", "60s"))
-        templates |= dict.fromkeys(keys, _constant(assumed)) if limit_a is None else {}
+        keys = [f"available_{direction}_power_{time}_w" for time in ("10s", "60s") if limit_a is None]
+        templates |= dict.fromkeys(
+            keys, _constant({"hint": f"current limit assumed: max_{direction}_a is not in [pack]"})
+        )
     components = {
         **{
             key: _sensor(key, entity, root, expiry_s) | _attributes(root, templates.get(key)) for key, entity in sensors
@@ -109,7 +109,8 @@ def discovery(
         **{f"alarm_{name}": _alarm(name, root) for name in inputs.alarms},
         **{name: control for name, control in _controls(root).items() if name in inputs.commands},
     }
-    names = settings.names | _cell_names(settings, inputs.cells)
+    numbers = range(1, inputs.cells + 1) if CELL in settings.names else ()
+    names = settings.names | {cell_key(number): f"{settings.names[CELL]} {number}" for number in numbers}
     return {
         "device": device,
         "origin": {"name": "bms_estimator", "sw_version": info.version},
@@ -133,12 +134,6 @@ def _removed_components(inputs: DiscoveryInputs) -> dict[str, dict[str, str]]:
     )
     platforms |= {name: control["platform"] for name, control in _controls("").items() if name not in inputs.commands}
     return {key: {"platform": platform} for key, platform in platforms.items()}
-
-
-def _cell_names(settings: HomeAssistantSettings, cells: int) -> dict[str, str]:
-    if CELL not in settings.names:
-        return {}
-    return {cell_key(number): f"{settings.names[CELL]} {number}" for number in range(1, cells + 1)}
 
 
 def _configured_name(names: Mapping[str, str], key: str) -> dict[str, str]:

@@ -89,7 +89,7 @@ _VERSION_ADAPTER, _HEADER_ADAPTER = TypeAdapter(_HeaderVersion), TypeAdapter(Cap
 
 
 def make_header(sensor: SensorSettings, source: BaseSource | None = None) -> CaptureHeader:
-    """Return the header of a capture of ``source``, or of the serial device of ``sensor`` if ``source`` is None."""
+    """Return the header of a capture of ``source``; without a source, of the serial device of ``sensor``."""
     if source is not None:
         device = CaptureHeader(sensor.protocol, source.short_description)
     else:

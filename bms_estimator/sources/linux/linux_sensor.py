@@ -294,7 +294,9 @@ class LinuxSensor(LineProducer):
             ) from None
 
     def _chip_interval_s(self) -> float:
-        """Return the update interval of the chip, at least 0.1 s; the default if the driver does not report one [s].
+        """Return the update interval of the chip, at least 0.1 s [s].
+
+        If the driver reports none, this is ``period_s``, the default sample period, because ``interval_s`` is not set.
 
         Raises:
             SourceUnavailableError: The interval is longer than the estimator accepts without gaps.

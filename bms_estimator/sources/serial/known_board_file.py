@@ -36,7 +36,7 @@ class KnownBoardFile:
 
     @property
     def accept_command(self) -> str:
-        """Command that makes the service accept another board, as text, without its last argument, the settings file."""
+        """Text of the command that accepts another board. The caller appends the path of the settings file."""
         return f"bms-estimator board --folder {self.path.parent} --accept"
 
     def load(self) -> Mapping[str, str]:

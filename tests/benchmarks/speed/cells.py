@@ -18,9 +18,10 @@ CELLS, CAPACITY_AH, RATE_HZ = 96, 50.0, 10
 """Number of cells of a large pack, its capacity [Ah], and the rate of its samples [1/s]."""
 SAMPLES = 20_000
 ROUNDS = 30
-"""Number of alternating measurements with and without the code of the cells, of which the shortest count."""
+"""Number of measurements with, and without, the code of the cells. They alternate, and the shortest one of each counts."""
 MAX_RATIO = 1.05
-"""Maximum ratio of the times of a pack without cell voltages. Repeated measurements differ by a few percent."""
+"""Maximum ratio of the times with and without the code of the cells, for a pack without cell voltages. Repeated measurements
+differ by a few percent."""
 
 
 def rows() -> Iterator[Row]:
@@ -78,7 +79,9 @@ def block_of_one_sample_ns() -> tuple[float, float]:
     best = np.full(2, np.inf)
     for _ in range(ROUNDS):
         for i, run in enumerate((run_with_cells, run_without_cells)):
-            estimator.state["started"] = 0  # the next sample counts as the first
+            estimator.state["started"] = (
+                0  # the next sample counts as the first, because its time is before the last one's
+            )
             best[i] = min(best[i], elapsed_ns(run))
     with_ns, without_ns = (best / SAMPLES).tolist()
     return with_ns, without_ns

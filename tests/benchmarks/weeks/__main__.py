@@ -1,8 +1,8 @@
 """Ablation study of the slow fit over simulated weeks: ``make ablation-weeks``.
 
-One part of the slow fit, of its anchors or of its hand-over is disabled at a time. Each entry of the table has RMSE of the
-SOC, fraction of time inside two std, mean std and interval score, all in %, as means over the days of the second half of
-each run, over the cases of a kind and over the seeds.
+Each run disables one part of the slow fit, of its anchors or of its hand-over. An entry of the table has four values in %:
+RMSE of the SOC, fraction of time within two std, mean std, and interval score. They are means over the days of the second half
+of each run, over the cases of a kind, and over the seeds.
 """
 
 import argparse
@@ -38,7 +38,7 @@ KINDS: dict[str, tuple[Case, ...]] = {
     ),
     "aging": (Case("LG M50", "full_nightly", aging=FAST),),
 }
-"""Cases by kind."""
+"""Cases by kind. A kind is named by its cells, its use or its source."""
 Scores = dict[tuple[str, str], list[Score]]
 """Scores by part and kind."""
 

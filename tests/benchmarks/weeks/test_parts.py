@@ -38,8 +38,9 @@ def everything(rng, pack):
             yield Phase(np.full(12 * hour, 0.15 * pack.one_c), "stopped")
             yield Phase(np.zeros(hour))
         yield Phase(np.full(12 * hour, -0.11 * pack.one_c), "stopped", is_seen=count % 3 != 1)
+        yield Phase(np.zeros(3 * hour))
         yield Phase(np.zeros(hour // 6), is_seen=False)
-        yield Phase(np.zeros(6 * hour))
+        yield Phase(np.zeros(3 * hour))
 
 
 @pytest.fixture(scope="module")

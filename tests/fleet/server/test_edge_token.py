@@ -31,7 +31,7 @@ RAW_BYTES = 8 << 20
 FLOOD_BLOCKS = 40
 """Number of blocks that an attacker sends. Each of them takes a worker a tenth of a second."""
 FLOOD_BYTES = 715_000
-"""Total size of the blocks with too many samples that an attacker sends [bytes]."""
+"""Total size of the blocks with too many samples that an attacker sends [bytes]. It gives the number of blocks."""
 MQTT_FAILURE = 0x80
 """Return code of a rejected MQTT subscription."""
 FORMER_SUBJECT = "p.*.raw.*"
@@ -177,6 +177,7 @@ async def test_blocks_with_too_many_samples_are_rejected_and_other_packs_are_not
         async with Heartbeats(reader) as heartbeats, worker(fleet):
             assert (await states.next_msg(LONG_S)).subject == subjects.published("p1", "state")
             await wait_for_count(heartbeats, "too_dense", count)
+    # the worker logs only the first rejection of a pack
     rejections = [line for line in logs if line["event"] == "a block is rejected"]
     assert [(line["pack"], line["reason"]) for line in rejections] == [("attacker", reason)]
     await admin.close()

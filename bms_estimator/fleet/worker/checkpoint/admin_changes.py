@@ -37,11 +37,11 @@ from bms_estimator.model.errors import UserError
 RESTORE_NAME, ERASE_NAME = "checkpoints-restore", "packs-remove"
 """Names with which the commands claim partitions."""
 MAX_CLAIMS = 20
-"""Maximum number of claims of a partition, because its worker may claim it again before its checkpoints are changed."""
+"""Maximum number of attempts to claim a partition. Its worker may claim it back before its checkpoints are changed."""
 TABLE_REFRESH_S = 3.0 * POLL_S
 """Waiting time until all workers have removed a pack from their copies of the table [s]."""
 MAX_TOKENS = 5
-"""Maximum position of a pack's name in a subject [tokens]."""
+"""Maximum position of a pack's name in the subjects that are searched in streams of other programs, counted from 1."""
 V = TypeVar("V")
 
 
@@ -106,7 +106,8 @@ async def restore_day(
         The daily checkpoints, by partition. Partitions without a checkpoint of the day remain unchanged, and are left out.
 
     Raises:
-        UserError: No partition has a checkpoint of the day, or one is damaged or of a version that this one cannot read.
+        UserError: No partition has a checkpoint of the day; or a checkpoint is damaged, or has a format that this program
+            cannot read.
     """
     pointers = await read_pointers(nc)
     daily_checkpoints = {
@@ -176,7 +177,7 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
         packs: Names of the packs.
 
     Raises:
-        UserError: The server has no streams, or the last checkpoint of a partition is of a version that this one cannot
+        UserError: The server has no streams, or the last checkpoint of a partition has a format that this program cannot
             read; then nothing is erased.
         StreamError: The server rejects a request.
     """
@@ -194,11 +195,13 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
         packs_of_partition = {pack for pack in packs if subjects.partition_of(pack, partitions) == number}
         for pack in packs_of_partition:
             blocks[pack] = await erase_messages(nc, subjects.RAW_STREAM, subjects.stored_raw(number, pack))
-            await erase_messages(nc, subjects.RAW_STREAM, subjects.stored(number, pack))  # changes of its row, fits
+            # the changes of the pack's row in the table, and the results of its fits
+            await erase_messages(nc, subjects.RAW_STREAM, subjects.stored(number, pack))
         checkpoints |= await _erase_states(nc, store, number, packs_of_partition)
     dead_letters = {pack: await erase_messages(nc, subjects.DEAD_STREAM, subjects.dead(pack)) for pack in packs}
     hours = {pack: await erase_messages(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
     for pack in packs:
+        # this stream allows no direct gets, which ``erase_messages`` needs; a request contains only sequence numbers
         await nc.jetstream().purge_stream(subjects.FITS_STREAM, subject=subjects.fit_request(pack))
         await erase_messages(nc, subjects.HISTORY_STREAM, subjects.history(pack))
     await purge_keys(nc, subjects.PACKS_BUCKET, packs)
@@ -213,7 +216,7 @@ async def _check_readable(store: CheckpointStore, partition: int) -> None:
     """Check that the last checkpoint of a partition can be rewritten.
 
     Raises:
-        UserError: It is of a version that this one cannot read.
+        UserError: The checkpoint has a format that this program cannot read.
     """
     try:
         await store.claims.check_format(partition)
@@ -222,7 +225,7 @@ async def _check_readable(store: CheckpointStore, partition: int) -> None:
 
 
 def _later_version_error(partition: int, error: UnreadableFormatError) -> UserError:
-    return UserError(f"partition {partition}: {error}, and erase with that version")
+    return UserError(f"partition {partition}: {error}, and erase the packs with that version")
 
 
 async def _erase_states(nc: Client, store: CheckpointStore, partition: int, packs: Collection[str]) -> dict[str, int]:
@@ -236,13 +239,13 @@ async def _erase_states(nc: Client, store: CheckpointStore, partition: int, pack
 
 
 async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: dict[str, int]) -> None:
-    """Rewrite the checkpoints that contain one of the packs of ``counts``, and count them there.
+    """Remove the packs that are the keys of ``counts`` from all checkpoints. Add the number of changed checkpoints to each value.
 
-    Damaged checkpoints and those of an unreadable version are removed. The newest intact one must be readable.
+    Damaged and unreadable checkpoints are removed, because they may contain the packs. The newest intact one must be readable.
 
     Raises:
         FencedError: A worker has claimed the partition meanwhile.
-        UnreadableFormatError: The newest intact checkpoint is of a version that this one cannot read.
+        UnreadableFormatError: The newest intact checkpoint has a format that this program cannot read.
     """
     claim = await store.claim(partition)
     checkpoints = claim.pointer.checkpoints
@@ -259,14 +262,15 @@ async def _rewrite_checkpoints(store: CheckpointStore, partition: int, counts: d
         readable.add(info)
         by_pack = _fields_by_pack(checkpoint)
         erased = {pack for pack in counts if any(pack in part for part in by_pack.values())}
-        if erased or store.is_damaged(info):  # a damaged increment may contain the packs
+        # a checkpoint with a damaged increment is readable up to it; the increment, which may contain the packs, is removed
+        if erased or store.is_damaged(info):
             parts: dict[str, Any] = {name: _without(part, erased) for name, part in by_pack.items()}
             rest = replace(checkpoint, **parts)
             claim = await store.replace(claim, info, rest.chunks(info.format))
         for pack in erased:
             counts[pack] += 1
     for info in checkpoints:
-        if info not in readable:  # an unreadable checkpoint may contain the packs
+        if info not in readable:
             claim = await store.replace(claim, info, None)
 
 

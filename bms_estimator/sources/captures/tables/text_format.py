@@ -19,7 +19,7 @@ MAX_HEADER_CHARACTERS = 1 << 20
 PROBED_LINES = 200
 """Number of lines after the header that show units, decimal sign and format of the time."""
 _DEVICE = re.compile(r".+ \[\d+\]")
-"""Name of a device in the line above the column names, by Victron VRM."""
+"""Name of a device, such as ``Battery Monitor [278]``. Victron VRM writes it in the line above the column names."""
 _NOT_SPACE_SEPARATED = re.compile(r"[\t;|]|,(?!\d)|[:'](?:\s|$)")
 """Characters that show that spaces do not separate columns: other separators, and punctuation after a word. A comma before a
 digit is a decimal comma."""
@@ -39,7 +39,7 @@ class TextFormat:
         separator: Separator of columns.
         decimal_comma: True if the decimal separator is a comma.
         is_quoted: True if each line is in quotes as a whole.
-        upper_layers: Number of columns at the left that belong to upper layers, such as cycles and steps, and are empty in rows.
+        upper_layers: Number of columns at the left that describe cycles and steps, and are empty in lines of samples.
     """
 
     layout: Layout
