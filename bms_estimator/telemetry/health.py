@@ -31,13 +31,13 @@ from bms_estimator.pack_model.history import DAY_S
 from bms_estimator.pack_model.slow_fit import SlowFit
 
 CONTRADICTION_STD, AGREEMENT_STD = 3.0, 2.0
-"""Difference between the estimate and the SOC by the device above which ``DEVICE_SOC_SUSPICION`` is suspected, and below which it is no longer
-suspected, in standard deviations of the difference."""
+"""Difference between the estimated SOC and the SOC of the device above which a contradiction is reported, and below which it is
+no longer reported, in standard deviations of the difference."""
 DEVICE_SOC_SUSPICION = (
     "the SOC that the device reports contradicts the voltage: check that the OCV curve belongs to this cell's chemistry, the number of "
     "cells in series and the sign of the current; a device that counts charge is also wrong long after its last full charge"
 )
-"""Suspicion of the chemistry, by the SOC of the device."""
+"""Text of this report in the field ``suspects`` of ``health``."""
 
 
 class FitTimes(NamedTuple):
@@ -218,7 +218,7 @@ def make_health_payload(
         edge: State of the fleet edge; None without an edge.
         hooks: Successes and failures of alarm hooks; None without hooks.
         pack_model: State of the slow fit; None without a slow fit.
-        contradicts_device: True: ``DEVICE_SOC_SUSPICION`` is suspected.
+        contradicts_device: True: ``suspects`` contains ``DEVICE_SOC_SUSPICION``.
     """
     state = record["observer"]
     return Health(
