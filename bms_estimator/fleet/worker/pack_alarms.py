@@ -74,9 +74,9 @@ class PackAlarms:
             trace: Their estimates.
             wall_offset_s: Wall clock of the edge minus the samples' clock [s].
         """
-        part, slow_fit = self._evaluation.io[0], pack_type.pack.slow_fit
-        part["wall_offset_s"], part["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
-        part["cells_at_s"], part["short_a"], part["reading_v"] = self._cell_values(pack_type)
+        io, slow_fit = self._evaluation.io[0], pack_type.pack.slow_fit
+        io["wall_offset_s"], io["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
+        io["cells_at_s"], io["short_a"], io["reading_v"] = self._cell_values(pack_type)
         self._has_events |= self._evaluation.run(
             self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace
         )
@@ -85,7 +85,7 @@ class PackAlarms:
             pack_type.alarms.bounds.describe(
                 name, samples[row - 1], cells_v[row - 1] if len(cells_v) == samples.size else NO_CELLS
             )[1]
-            for name, row in zip(QUANTITIES, part["impossible"].tolist(), strict=True)
+            for name, row in zip(QUANTITIES, io["impossible"].tolist(), strict=True)
             if row
         ]
 
