@@ -13,7 +13,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 
 CURVE_NODES, DIRECTION_NODES, SHAPE_NODES = 101, 51, 6
-"""Number of SOC nodes of the OCV's error, of the error by direction, and of the error of the resistances."""
+"""Number of SOC nodes of the OCV's error, of the direction-dependent error, and of the error of the resistances."""
 RESISTANCE_GROUPS = (0, 1, 1, 1, 2, 2, 2)
 """Group of each resistance: 0 series resistance, 1 RC pairs up to 30 s, 2 slower RC pairs. Those of a group share a scale."""
 MODEL_ROW = np.dtype(
@@ -31,7 +31,7 @@ MODEL_ROW = np.dtype(
         ("hysteresis", "f8", 2),  # fast and slow part, counted from 0 at the start of the segment
         ("start_h_decay", "f8", 2),  # remaining fraction of both parts' values at the start of the segment
         ("aging_trend", "f8"),  # ln of the factor on the resistances for an aging of 1 std
-        ("direction_v", "f8"),  # std of the error by direction [V]
+        ("direction_v", "f8"),  # std of the direction-dependent error [V]
     ],
     align=True,
 )

@@ -1,11 +1,11 @@
 """Lower bound of the std of the SOC, which remains after infinite time, and changes of use or sensors that lower it.
 
 A pack passes a window of SOC repeatedly. Every error that differs from pass to pass averages out. What remains is the
-error of the cell file's OCV curve, and an error by direction (charge, discharge, rest) that recurs at each pass. The
+error of the cell file's OCV curve, and a direction-dependent error (charge, discharge, rest) that recurs at each pass. The
 unknowns are the SOC, the capacity, the hysteresis and the curve, with the priors of the slow fit. The model is linear in
 small deviations:
 
-    voltage error = slope (dSOC + (SOC - middle) d ln Q) + hysteresis + curve + error by direction
+    voltage error = slope (dSOC + (SOC - middle) d ln Q) + hysteresis + curve + direction-dependent error
 
 This std is a lower bound: no estimator with only the information of the cell file has a smaller error on average over the
 possible cells and over the window. At single SOCs, as near full, the std may be smaller than this mean. Resistances are left
@@ -55,7 +55,7 @@ SOC, LN_Q, HYSTERESIS, CURVE = 0, 1, 2, 3
 
 @dataclass(frozen=True)
 class Window:
-    """SOCs that a pack passes again and again, and what is measured of it."""
+    """SOCs that a pack passes repeatedly, and the quantities that are measured."""
 
     low: float
     high: float = 0.95
@@ -120,8 +120,10 @@ class Accuracy:
             self.soc.size
         )  # positive definite despite rounding
         if not self.window.has_temperature:
-            by_kelvin_v = np.hypot(np.interp(self.soc, SOC_GRID, self.cell.per_kelvin_v), ENTROPY_STD_V)
-            curve_v2 += np.outer(UNMEASURED_K * by_kelvin_v, UNMEASURED_K * by_kelvin_v)
+            temperature_std_v = UNMEASURED_K * np.hypot(
+                np.interp(self.soc, SOC_GRID, self.cell.per_kelvin_v), ENTROPY_STD_V
+            )
+            curve_v2 += np.outer(temperature_std_v, temperature_std_v)
         covariance[CURVE:, CURVE:] = curve_v2
         return covariance
 
@@ -129,12 +131,15 @@ class Accuracy:
         """Return the information on the unknowns: of discharge, rest and charge, and of the ends of charge."""
         distance = np.abs(self.soc[:, None] - self.soc)
         precision = np.linalg.inv(np.exp(-distance / DIRECTION_CORRELATION_SOC)) / self.cell.direction_std_v**2
+        # sign of the hysteresis in discharges, in the rests after them, and in charges
         signs = (-1.0, -1.0, 1.0) if self.window.charge_seen else (-1.0, -1.0)
         slope_v = self.cell.slope(self.soc)
-        half_v = np.interp(self.soc, SOC_GRID, self.cell.hysteresis_v)
+        hysteresis_v = np.interp(self.soc, SOC_GRID, self.cell.hysteresis_v)
         total = np.zeros((CURVE + self.soc.size,) * 2)
         for sign in signs:
-            h = np.column_stack([slope_v, slope_v * (self.soc - self.middle), sign * half_v, np.eye(self.soc.size)])
+            h = np.column_stack(
+                [slope_v, slope_v * (self.soc - self.middle), sign * hysteresis_v, np.eye(self.soc.size)]
+            )
             total += h.T @ precision @ h
         if self.window.full:
             at_full = self.soc_derivatives(np.ones(1))[0]

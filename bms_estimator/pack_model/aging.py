@@ -17,9 +17,9 @@ MIN_VARIANCE = 1e-12
 class Aging:
     """Stds of the change of ln of a quantity by aging. Its variance is proportional to use plus time."""
 
-    by_use: float
+    use_std: float
     """Std of the change over a charge throughput of ``CellCurves.aged_soc`` (500 full cycles)."""
-    by_time: float
+    time_std: float
     """Std of the change over a year without use."""
 
 
@@ -49,7 +49,7 @@ class AgingVariance:
         last = np.append(np.where(intervals.is_new_segment[1:], intervals.ends[:-1], starts[1:]), rows.size - 1)
         used_soc = np.maximum(rows["throughput_soc"][last] - rows["throughput_soc"][starts], 0.0)
         elapsed_s = np.append(rows["elapsed_s"][starts], rows["elapsed_s"][-1])
-        steps = aging.by_use**2 * used_soc / cell.aged_soc + aging.by_time**2 * np.diff(elapsed_s) / YEAR_S
+        steps = aging.use_std**2 * used_soc / cell.aged_soc + aging.time_std**2 * np.diff(elapsed_s) / YEAR_S
         self.at_start: Floats = np.append(0.0, np.cumsum(steps)[:-1])
         duration_s = float(elapsed_s[-1] - elapsed_s[0])
         rate = float(steps.sum()) / duration_s if duration_s > 0.0 else 0.0

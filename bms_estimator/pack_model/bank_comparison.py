@@ -169,7 +169,7 @@ class Reference:
     """Reference curve of a bank, with the model for comparisons with it."""
 
     fit: PackFit
-    """Fit by which E_o is computed from the voltages of the discharge."""
+    """Fit with which E_o is computed from the voltages of the discharge."""
     curve: ReferenceCurve
     common: CommonChange
     """Std of the changes since the reference."""
@@ -252,5 +252,5 @@ def _covariance(cell: CellCurves, reference: Reference, measured: OpenCircuit) -
     )
     correlation = (1.0 - INDEPENDENT_FRACTION) * np.exp(-np.abs(z[:, None] - z) / CORRELATED_SOC)
     correlation[np.diag_indices(z.size)] = 1.0
-    by_load_v2 = (LOAD_DROP_STD * (measured.drop_v - curve.drop_v)) ** 2
-    return np.asarray(np.outer(std_v, std_v) * correlation + common @ common.T + np.diag(by_load_v2))
+    load_error_v2 = (LOAD_DROP_STD * (measured.drop_v - curve.drop_v)) ** 2
+    return np.asarray(np.outer(std_v, std_v) * correlation + common @ common.T + np.diag(load_error_v2))

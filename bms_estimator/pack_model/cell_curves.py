@@ -23,10 +23,10 @@ ZERO_C_K = 273.15
 SECANT_HALF_WIDTH_SOC = 0.01
 """Half width of the secant that gives the slope of the OCV [SOC]: the secant covers the SOC range of a row (``ROW_SOC``)."""
 DIRECTION_STD_FRACTION = 0.5
-"""Std of the error by direction, as a fraction of the OCV's std. The error by direction is the part of the OCV's error that
+"""Std of the direction-dependent error, as a fraction of the OCV's std. The direction-dependent error is the part of the OCV's error that
 differs between charge, rest and discharge."""
 DIRECTION_STD_RANGE_V = 2e-3, 6e-3
-"""Limits of the std of the error by direction [V]. The lower one is assumed for cells whose file was fitted to their own
+"""Limits of the std of the direction-dependent error [V]. The lower one is assumed for cells whose file was fitted to their own
 captures, and the upper one for generic cells."""
 OVERPOTENTIAL_STD_FRACTION = 0.25
 """Relative std of the difference of the overpotential between charge and discharge, as a fraction of the std of ln R."""
@@ -63,13 +63,13 @@ class CellCurves:
         self.direction_std_v = float(
             np.clip(DIRECTION_STD_FRACTION * np.median(self.ocv_std_v), *DIRECTION_STD_RANGE_V)
         )
-        """Std of the error by direction [V]."""
+        """Std of the direction-dependent error [V]."""
         self.drop_std = float(np.clip(OVERPOTENTIAL_STD_FRACTION * self.r_std, *OVERPOTENTIAL_STD_RANGE))
         """Relative std of the difference of the overpotential between charge and discharge at one SOC."""
         self.charge_error = float(settings["charge_error"])
         """Std of the SOC counted over a charge throughput of 1."""
         self.aged_soc = float(settings["aged_soc"])
-        """Charge throughput of the std ``Aging.by_use`` [SOC]: 500 full cycles."""
+        """Charge throughput of the std ``Aging.use_std`` [SOC]: 500 full cycles."""
         self.event_probability, self.event_s = float(settings["event_probability"]), float(settings["event_s"])
         """Probability that a long gap hides a charge or an exchange of the pack, and the time constant with which the
         probability grows with the gap's duration [s]."""

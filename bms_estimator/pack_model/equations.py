@@ -101,9 +101,9 @@ class Equations:
         self.known_std = std * np.where(kind == EMPTY, math.sqrt(max(int((kind == EMPTY).sum()), 1)), 1.0)
 
     def weaken_misfits(self, r: Residuals) -> bool:
-        """Divide the weight of the rows of one SOC zone and direction by their RMS residual, as a multiple of ``FITTED_RMS``.
+        """Lower the weight of the rows of each SOC zone and direction whose RMS residual exceeds ``FITTED_RMS``, by their ratio.
 
-        A cell that the model cannot fit thereby gets a larger std, and the zones that it fits determine the unknowns.
+        A cell that the model cannot fit thereby gets a larger std, and the zones that the model fits determine the unknowns.
 
         Returns:
             True if a weight changed.
@@ -145,22 +145,22 @@ class Equations:
 
     def _voltage_block(self, r: Residuals, *, use_file_slope: bool) -> Block:
         columns, values = self.model.derivatives(r.x, r.prediction, use_file_slope=use_file_slope)
-        limit = huber_weight(r.voltage)
-        return Block(limit * r.voltage, columns, (limit * self.weight)[:, None] * values)
+        factor = huber_weight(r.voltage)
+        return Block(factor * r.voltage, columns, (factor * self.weight)[:, None] * values)
 
     def _soc_blocks(self, r: Residuals) -> tuple[Block, Block]:
         """Return the blocks of known SOCs and of SOCs beyond their tolerated range."""
         columns, values = self.model.soc_derivatives(r.x)
-        known_rows, out = self.known_rows, np.flatnonzero(r.soc_excess)
+        known_rows, excess_rows = self.known_rows, np.flatnonzero(r.soc_excess)
         known_columns = np.column_stack([columns[known_rows], np.full(known_rows.size, self.unknowns.full.start)])
         known_values = np.column_stack([values[known_rows], self.is_full]) / self.known_std[:, None]
         return (
             Block(r.reference, known_columns, known_values),
-            Block(-r.soc_excess[out], columns[out], values[out] / EXCESS_STD_SOC),
+            Block(-r.soc_excess[excess_rows], columns[excess_rows], values[excess_rows] / EXCESS_STD_SOC),
         )
 
     def _link(self, x: Floats) -> tuple[float, Block]:
-        """Return cost and residuals of the SOC at the start of each interval, counted from the start of the previous interval.
+        """Return cost and residuals of the links: the SOC at the start of an interval, counted from the previous start.
 
         The SOC after a gap has the density of a mixture: normal about the counted SOC, and, with the probability of a hidden
         charge, uniform over 0..1 with a density of 1. The residual is weighted by the probability that no charge was hidden.

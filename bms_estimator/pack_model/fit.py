@@ -101,7 +101,7 @@ class PackFit:
     cost: float
     """Cost of the best minimum."""
     curves: tuple[Floats, ...]
-    """Nodes of the OCV's error and of the error by direction at each minimum, the best first. The next fit starts there."""
+    """Nodes of the OCV's error and of the direction-dependent error at each minimum, the best first. The next fit starts there."""
     first_segment: float = 0.0
     """Number of the first fitted segment. Earlier segments were measured on another pack."""
     is_exchanged: bool = False
@@ -172,7 +172,7 @@ def reference_of(previous: PackFit, rows: NDArray[np.void]) -> Reference:
 
 
 def _fit_at_reference(cell: CellCurves, rows: NDArray[np.void], previous: PackFit | None) -> PackFit:
-    """Fit the rows. Their std is computed at the previous fit, or at a preliminary fit if there was no previous fit."""
+    """Fit the rows. The std of each row is computed at the previous fit; without one, at a preliminary fit."""
     if previous is None:
         previous = _minimize_from_all_starts(cell, rows, Reference(rows["soc"], np.zeros(SCALES)), None)
     return _minimize_from_all_starts(cell, rows, reference_of(previous, rows), previous)
@@ -225,7 +225,7 @@ def starts(equations: Equations, previous: PackFit | None) -> list[Floats]:
 
 
 def filter_soc(equations: Equations, ln_q: float) -> Floats:
-    """Return the SOC at the start of each interval by the filter's SOC at its end and the charge counted in it."""
+    """Return the SOC at the start of each interval, from the filter's SOC at its end and the charge counted in it."""
     intervals = equations.intervals
     drawn_soc = intervals.drawn_soc[intervals.ends] * math.exp(-ln_q)
     return np.asarray(equations.rows["soc"][intervals.ends] + drawn_soc)

@@ -54,16 +54,16 @@ class OpenCircuit:
             soc: SOC of the rows, shape (n,).
         """
         temperature_c = rows["temperature_c"]
-        drops = Overpotential(cell, fit, rows)
-        drop_v = drops.at(soc[:, None])[:, 0]
+        overpotential = Overpotential(cell, fit, rows)
+        drop_v = overpotential.at(soc[:, None])[:, 0]
         hysteresis_v = (
             fit.hysteresis
             * arrhenius(HYSTERESIS_ACTIVATION_ENERGY, temperature_c)
             * np.interp(soc, SOC_GRID, cell.hysteresis_v)
         )
-        by_temperature_v = (temperature_c - REFERENCE_C) * np.interp(soc, SOC_GRID, cell.per_kelvin_v)
         e_o_v = rows["voltage_v"] / cell.series + drop_v - hysteresis_v * rows["hysteresis"].mean(axis=1)
-        return cls(soc, e_o_v - by_temperature_v - fitted_ocv(cell, fit, soc), drop_v, temperature_c, drops)
+        e_o_at_25_c_v = e_o_v - (temperature_c - REFERENCE_C) * np.interp(soc, SOC_GRID, cell.per_kelvin_v)
+        return cls(soc, e_o_at_25_c_v - fitted_ocv(cell, fit, soc), drop_v, temperature_c, overpotential)
 
 
 class Overpotential:

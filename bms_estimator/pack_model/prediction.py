@@ -1,11 +1,11 @@
-"""Predicted voltage of each history row, with its variance and its derivatives by the unknowns x.
+"""Predicted voltage of each history row, with its variance and its derivatives with respect to the unknowns x.
 
-    v = OCV(z, T) + error of the OCV(z) + hysteresis - sum of scaled resistances times currents + error by direction
+    v = OCV(z, T) + error of the OCV(z) + hysteresis - sum of scaled resistances times currents + direction-dependent error
     z = SOC at the start of the interval - (charge - offset t) / (capacity)
 
 All voltages are of one cell. docs/theory/pack-model.md has the complete equations.
 
-An error that repeats whenever the pack passes an SOC in one direction is one unknown, the error by direction. More passes
+An error that repeats whenever the pack passes an SOC in one direction is one unknown, the direction-dependent error. More passes
 therefore do not lower the std of the curve below the std of this error.
 """
 
@@ -41,8 +41,8 @@ KNEE_STD_SOC, KNEE_WIDTH_SOC = 0.008, 0.12
 from empty gave an SOC 6 to 8 % wrong, because errors of offset, capacity and knee have equal effects on the voltage. Fits of 4 to
 24 h of six real histories had an RMS error of 1.6 % with 0.008, 2.3 % with 0.015, and 1.9 % with 0.005."""
 SURFACE_STD_SOC, SURFACE_WIDTH_SOC = 0.03, 0.25
-"""Std of the SOC at the surface of the particles about the model, per C-rate of discharge at 25 C, and SOC over which it decays
-[SOC]. The C-rate is that of the current filtered by ``TREND_PAIR``. The voltage collapses when the surface is empty: at 0 C
+"""Std of the difference between the SOC at the surface of the particles and the model's, per C-rate of discharge at 25 C, and
+SOC over which it decays [SOC]. The C-rate is that of the current filtered by ``TREND_PAIR``. The voltage collapses when the surface is empty: at 0 C
 and 1C, a cell of 58 Ah ends its discharge with 20 % of its charge left. Without this std, the fit takes the collapse for the knee of
 the OCV. Diffusion depends on the temperature as the strong part of the resistances does."""
 START_LOAD_C = 0.6
@@ -127,9 +127,9 @@ class VoltageModel:
     def _variance(self, z: Floats, drop_v: Floats) -> Floats:
         """Return the variance of each row's voltage about its prediction [V^2]."""
         near_empty, cell = np.exp(-((z / KNEE_WIDTH_SOC) ** 2)), self.cell
-        by_pass_v2 = cell.direction_std_v**2 + (PASS_FRACTION * cell.drop_std * drop_v) ** 2
-        by_soc_v2 = (cell.slope(z) * (COUNT_STD_SOC + KNEE_STD_SOC * near_empty)) ** 2
-        return np.asarray(by_pass_v2 + by_soc_v2)
+        pass_error_v2 = cell.direction_std_v**2 + (PASS_FRACTION * cell.drop_std * drop_v) ** 2
+        soc_error_v2 = (cell.slope(z) * (COUNT_STD_SOC + KNEE_STD_SOC * near_empty)) ** 2
+        return np.asarray(pass_error_v2 + soc_error_v2)
 
     def soc(self, x: Floats) -> Floats:
         """Return the SOC of each row."""
@@ -163,12 +163,12 @@ class VoltageModel:
         Args:
             x: Unknowns.
             p: Prediction at ``x``.
-            use_file_slope: True: the derivative by SOC is the slope of the cell file's OCV, for the covariance. The fitted
-                correction is rough, and its slopes would count as information on the SOC.
+            use_file_slope: Use the slope of the cell file's OCV as the derivative with respect to the SOC. The covariance
+                requires this, because the fitted correction is rough, and its slopes would count as information on the SOC.
         """
         slope_v = self.cell.slope(p.soc) if use_file_slope else self._slope_v(x, p.soc)
-        by_soc = self.soc_derivatives(x)[1] * slope_v[:, None]
-        return voltage_derivatives(self.rows, self.cell.table, x, self.unknowns.first, p.soc, by_soc)
+        through_soc = self.soc_derivatives(x)[1] * slope_v[:, None]  # chain rule
+        return voltage_derivatives(self.rows, self.cell.table, x, self.unknowns.first, p.soc, through_soc)
 
     def _slope_v(self, x: Floats, z: Floats) -> Floats:
         """Return the slope of the predicted voltages over SOC [V per unit SOC], as a secant over the SOC range of a row.

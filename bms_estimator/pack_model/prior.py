@@ -33,7 +33,7 @@ is better defined at the steep ends."""
 ROUNDING_V2 = 1e-10
 """Variance added to each node of the OCV's error, so that rounding leaves its covariance positive definite [V^2]."""
 DIRECTION_CORRELATION_SOC = 0.1
-"""Correlation length of the error by direction [SOC]."""
+"""Correlation length of the direction-dependent error [SOC]."""
 SHAPE_STD, SHAPE_CORRELATION_SOC = 0.15, 0.4
 """Std and correlation length [SOC] of the relative error of the file's resistances over SOC."""
 EMPTY_SHAPE_STD = 0.5
@@ -121,15 +121,15 @@ class Prior:
             diagonal[part] = 1.0 / std**2
 
     def _add_functions_of_soc(self, cell: CellCurves, u: Unknowns) -> None:
-        """Add the nodes of the OCV's error, of the error by direction, and of the resistances' error over SOC."""
+        """Add the nodes of the OCV's error, of the direction-dependent error, and of the resistances' error over SOC."""
         nodes = np.linspace(0.0, 1.0, CURVE_NODES)
         covariance = curve_covariance(cell, nodes) + ROUNDING_V2 * np.eye(CURVE_NODES)
         self.precision[u.curve, u.curve] = np.linalg.inv(covariance)
-        by_direction = node_precision(DIRECTION_NODES, DIRECTION_CORRELATION_SOC)
-        self.precision[u.direction, u.direction] = np.kron(np.eye(DIRECTIONS), by_direction)
+        direction_precision = node_precision(DIRECTION_NODES, DIRECTION_CORRELATION_SOC)
+        self.precision[u.direction, u.direction] = np.kron(np.eye(DIRECTIONS), direction_precision)
         shape_std = np.array([EMPTY_SHAPE_STD, *[SHAPE_STD] * (SHAPE_NODES - 1)])
-        by_shape = node_precision(SHAPE_NODES, SHAPE_CORRELATION_SOC)
-        self.precision[u.shape, u.shape] = by_shape / np.outer(shape_std, shape_std)
+        shape_precision = node_precision(SHAPE_NODES, SHAPE_CORRELATION_SOC)
+        self.precision[u.shape, u.shape] = shape_precision / np.outer(shape_std, shape_std)
 
     def _add_soc(self, intervals: Intervals, u: Unknowns) -> None:
         """Add the SOC at the start of each segment."""

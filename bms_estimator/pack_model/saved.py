@@ -61,7 +61,7 @@ _FIT_RANGES = {
 }
 """Range of each saved field of a fit."""
 _CURVE_UNKNOWNS = CURVE_NODES + DIRECTIONS * DIRECTION_NODES
-"""Number of unknowns of the OCV's error and of the error by direction."""
+"""Number of unknowns of the OCV's error and of the direction-dependent error."""
 BANK_PREFIX = "bank_"
 """Prefix of the arrays of the first discharges of a bank and of the fit after them."""
 

@@ -76,7 +76,7 @@ def minimize(equations: Equations, start: Floats, known: Sequence[Minimum] = ())
                 break
     if any(is_same(equations, now, other) for other in known):
         return None
-    # slopes of the fitted correction would count as information on the SOC
+    # with the file's slope, because slopes of the fitted correction would count as information on the SOC
     precision = equations.normal_equations(now, use_file_slope=True).a
     return Minimum(now.x, now.cost, cholesky(precision, equations.unknowns.soc.start))
 
@@ -92,9 +92,9 @@ def step(normal: NormalEquations, damping: float, u: Unknowns) -> Floats:
     a = normal.a.copy()
     a.ravel()[:: u.size + 1] *= 1.0 + damping
     lower = cholesky(a, u.soc.start)
-    full = backward_substitution(lower, forward_substitution(lower, normal.b))
-    largest = float(np.abs(full[u.soc]).max())
-    return full * min(1.0, MAX_STEP_SOC / largest) if largest > 0.0 else full
+    full_step = backward_substitution(lower, forward_substitution(lower, normal.b))
+    largest_soc = float(np.abs(full_step[u.soc]).max())
+    return full_step * min(1.0, MAX_STEP_SOC / largest_soc) if largest_soc > 0.0 else full_step
 
 
 def cholesky(a: Floats, sparse_count: int) -> Floats:

@@ -48,7 +48,7 @@ class Unknowns:
     curve: slice
     """Error of the file's OCV at ``CURVE_NODES`` SOCs [V]."""
     direction: slice
-    """Error by direction at ``DIRECTION_NODES`` SOCs, for charge, rest and discharge, relative to its std."""
+    """Direction-dependent error at ``DIRECTION_NODES`` SOCs, for charge, rest and discharge, relative to its std."""
 
     @property
     def size(self) -> int:

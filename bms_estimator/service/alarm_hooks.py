@@ -91,9 +91,8 @@ class AlarmHooks:
     ) -> None:
         """Restore the alarms of an earlier run.
 
-        Jobs of these alarms are not repeated, but the relay is set to its level. A hook that is new, or whose jobs
-        were not finished, runs its jobs. If a hook had failed in the earlier run, all hooks repeat
-        their jobs, so that the failed one is not lost.
+        Jobs of these alarms are not repeated, but the relay is set to its level. A hook that is new, or whose jobs were not
+        finished, runs its jobs. If ``hook_failed`` was raised, all hooks repeat their jobs, so that the failed one is not lost.
 
         Args:
             alarms: All alarms.

@@ -48,7 +48,7 @@ class AlarmMonitor:
         changed: Event that is set with each change of an alarm.
 
     Raises:
-        UserError: A setting of the alarms is not valid for the pack (``watched``).
+        UserError: A setting of the alarms is not valid for the pack (``monitored_alarms``).
     """
 
     def __init__(
@@ -72,12 +72,12 @@ class AlarmMonitor:
         self._evaluated_s = -math.inf
         self._is_stopped = False
 
-    def add(self, received: ReceivedSamples, step: RunResult, now_s: float, cells_fault: str = "") -> bool:
+    def add(self, received: ReceivedSamples, result: RunResult, now_s: float, cells_fault: str = "") -> bool:
         """Evaluate the alarms on received samples and their estimates; report changes if this is due.
 
         Args:
             received: Samples and cell voltages.
-            step: Result of the samples.
+            result: Result of the samples.
             now_s: Monotonic clock [s].
             cells_fault: Reason why the cell voltages cannot be used; empty if they can.
 
@@ -89,10 +89,10 @@ class AlarmMonitor:
             is_new, self._cells_seen = cells is not self._cells_seen, cells
             self.alarms.evaluate(
                 received.samples,
-                step.trace,
+                result.trace,
                 received.cells_v,
                 self._clock.wall(),
-                forecasts=step.forecasts,
+                forecasts=result.forecasts,
                 probes=received.probes,
                 cells_fault=cells_fault,
                 clock_fault=self._source.clock_fault,
@@ -137,7 +137,7 @@ class AlarmMonitor:
         return self.alarms.is_watching
 
     def stop(self) -> None:
-        """Stop changing alarms, because the final save would lack a change that hooks have reported."""
+        """Ignore further changes of the alarms: hooks would act on a change that the final save lacks."""
         self._is_stopped = True
 
     def acknowledge(self, name: AlarmName | None) -> list[AlarmName]:

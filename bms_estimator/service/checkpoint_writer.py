@@ -49,7 +49,7 @@ log = structlog.get_logger(__name__)
 
 
 class CheckpointWriter:
-    """Saves the estimator's state in a separate thread, so that a slow disk delays nothing else.
+    """Writer that saves the state of a pack in a separate thread, so that a slow disk delays nothing else.
 
     Args:
         pack: The pack; read only.
@@ -83,7 +83,7 @@ class CheckpointWriter:
         self._discarded = 0  # number of histories whose files were quarantined
         self._saved_counters: RunCounters | None = None
         """Counters and alarms of the last save; None before the first save of this run."""
-        status.saved_flow = totals.charge_energy
+        status.saved_charge_energy = totals.charge_energy
         self._saved_fit = self._fit  # fit of the saved state
         self._saved_progress: tuple[int, float] | None = None
         """Samples and SOC (``_progress``) of the last saved state; None: this run has not saved a state."""
@@ -98,7 +98,7 @@ class CheckpointWriter:
             self._raise_state_lost()
         while True:
             await self._wait_for_alarm(min(CHECK_INTERVAL_S, self._interval_s))
-            run_file_delay_s = RETRY_S if run_file_failures else self._delay_of_counters_s
+            run_file_delay_s = RETRY_S if run_file_failures else self._counters_delay_s
             if not run_file_failures and await self._is_run_file_missing():
                 self._saved_counters, run_file_delay_s = None, 0.0
             if loop.time() >= run_file_tried_s + run_file_delay_s:
@@ -167,7 +167,7 @@ class CheckpointWriter:
         return int(state["samples"]), float(np.nan_to_num(state["soc"]))
 
     @property
-    def _delay_of_counters_s(self) -> float:
+    def _counters_delay_s(self) -> float:
         """Minimum interval between two saves of counters and alarms [s]; 0 if the next one is urgent."""
         if self._saved_counters is None or self._slots.cell_indices != self._saved_counters.cell_slots:
             return 0.0
@@ -195,10 +195,10 @@ class CheckpointWriter:
         if counters == self._saved_counters:
             return True
         if not await self._write(lambda: file.save(counters), file.path):
-            self._status.saved_flow = None  # the unsaved totals are published
+            self._status.saved_charge_energy = None  # the unsaved totals are published
             return False
         self._saved_counters = counters
-        self._status.saved_flow = ChargeEnergy.from_totals(counters.total)
+        self._status.saved_charge_energy = ChargeEnergy.from_totals(counters.total)
         return True
 
     async def _save(self, *, whole: bool = False) -> bool:

@@ -42,13 +42,13 @@ def program_environment(passed: Collection[str], fields: Mapping[str, str]) -> d
 
 
 async def run_program(
-    command: Sequence[str], text: bytes, variables: Mapping[str, str], timeout_s: float
+    command: Sequence[str], stdin: bytes, variables: Mapping[str, str], timeout_s: float
 ) -> int | None:
     """Run a program until it and all its descendants have ended.
 
     Args:
         command: The program and its arguments.
-        text: Standard input.
+        stdin: Standard input.
         variables: Environment.
         timeout_s: Time after which the program and its descendants are killed [s].
 
@@ -73,7 +73,7 @@ async def run_program(
     marked_variable = f"{MARK_VARIABLE}={mark}".encode()
     try:
         async with asyncio.timeout(timeout_s):
-            await process.communicate(text)
+            await process.communicate(stdin)
             # polled, because the end of a grandchild causes no event
             while await _find_processes(process.pid, marked_variable) != []:  # noqa: ASYNC110
                 await asyncio.sleep(POLL_INTERVAL_S)

@@ -86,7 +86,7 @@ class HookJobs:
         return job
 
     def put_back(self, job: Job) -> None:
-        """Put back a job that was not done. If its alarm has changed since, neither it nor its opposite is due."""
+        """Put back a job that was not done. If its alarm has changed back, drop the job and the waiting opposite job."""
         is_raised = job.key in self._raised if job.key else bool(self._raised)
         if is_raised != (job.state == "raised"):
             if self._reports_cleared:
@@ -200,10 +200,10 @@ class CommandHook(JobHook):
     async def _run_job(self, job: Job) -> bool:
         """Run the program once. Return False if it could not be started."""
         fields = self._fields(job)
-        text, timeout_s = fields.pop("json").encode(), self.settings.timeout_s
+        stdin, timeout_s = fields.pop("json").encode(), self.settings.timeout_s
         variables = program_environment(self.settings.pass_environment, fields)
         try:
-            code = await run_program(self.settings.run or (), text, variables, timeout_s)
+            code = await run_program(self.settings.run or (), stdin, variables, timeout_s)
         except StartError as error:
             self._fail(job, f"cannot be started: {error}")
             log.warning("alarm hook: the program cannot be started", hook=self.description, error=str(error))

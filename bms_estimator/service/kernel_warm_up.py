@@ -62,7 +62,7 @@ def _call_kernels() -> None:
     known_rows(trace, False)
     alarms = AlarmEvaluator(Settings(), estimator)
     alarms.evaluate(sample, trace, NO_CELLS, arrival_s=0.0)
-    alarms.on_silence(SILENT_S, now_s=0.0, reason="", steady_s=0.0)
+    alarms.on_silence(SILENT_S, now_s=0.0, reason="", monotonic_s=0.0)
     alarms.evaluate_hooks((), passed_s=0.0, now_s=0.0)
     alarms.acknowledge(None)
     pack = cell.pack(MIN_CELLS, 1)

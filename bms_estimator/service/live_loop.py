@@ -78,7 +78,7 @@ class FitThread:
             self.times = FitTimes(self._clock.wall(), self._clock.monotonic() - started_s)
 
 
-LAG_STEP_S = 0.1
+LAG_INTERVAL_S = 0.1
 """Interval at which the loop's lag is measured [s]. Any longer blocking of the loop is noticed."""
 SEND_ITERATIONS = 2
 """Iterations of the event loop that send a published estimate: one takes it from the outbox, one writes it."""
@@ -256,14 +256,14 @@ async def _estimate(
         if edge:
             edge.take(received.samples, received.cells_v)
         publisher.alarm_monitor.check_silence()
-        step = pack.run(received.samples, received.cells_v, received.device_soc)
-        totals.add(step.trace)
+        result = pack.run(received.samples, received.cells_v, received.device_soc)
+        totals.add(result.trace)
         try:
             # the sinks send now, so that the alarms do not delay them and a source that always has a block does not starve them
-            for _ in range(SEND_ITERATIONS if publisher.add_estimates(received, step) else 1):
+            for _ in range(SEND_ITERATIONS if publisher.add_estimates(received, result) else 1):
                 await asyncio.sleep(0)
         finally:  # the final save needs the alarms of all samples
-            publisher.add_to_alarms(received, step, slots.fault)
+            publisher.add_to_alarms(received, result, slots.fault)
 
 
 async def _keep_alive(
@@ -289,6 +289,6 @@ async def _measure_lag(publisher: Publisher) -> None:
     """Measure the delay of the event loop, by which samples and requests may be late."""
     loop = asyncio.get_running_loop()
     while True:
-        due_s = loop.time() + LAG_STEP_S
-        await asyncio.sleep(LAG_STEP_S)
+        due_s = loop.time() + LAG_INTERVAL_S
+        await asyncio.sleep(LAG_INTERVAL_S)
         publisher.add_lag(loop.time() - due_s)

@@ -144,13 +144,13 @@ async def run_pack_service(
             stop=stop,
             files=StateFiles(folder, settings, model) if folder else None,
             parts=ServiceParts(
-                ServiceStatus(delivery, device.health, partial(recording_health, tap)),
-                requests,
-                device.store_current_zero,
-                board.board_check if board else None,
-                notifier,
-                hooks,
-                block_sender,
+                status=ServiceStatus(delivery, device.health, partial(recording_health, tap)),
+                requests=requests,
+                store_current_zero=device.store_current_zero,
+                board_check=board.board_check if board else None,
+                notifier=notifier,
+                hooks=hooks,
+                edge=block_sender,
             ),
         )
     log.info("stopped", pack=settings.pack.name, state="saved" if folder else "not saved")

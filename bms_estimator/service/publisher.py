@@ -52,7 +52,7 @@ SOURCE_HUNG_S = 20.0
 
 
 class Publisher:
-    """Makes a snapshot when one is due and passes it to the sinks.
+    """Publisher that makes snapshots at intervals, and passes them to the sinks.
 
     Args:
         settings: The pack's settings.
@@ -62,7 +62,7 @@ class Publisher:
         clock: The clocks.
         status: State of the service around the pack.
         totals: Lifetime totals; default: new totals.
-        on_alarm: Called with each alarm that is raised or cleared.
+        on_alarm: Called with each change of an alarm.
 
     Attributes:
         alarm_monitor: Alarm monitor.
@@ -93,7 +93,7 @@ class Publisher:
         self._forecast_sent_s = -math.inf  # time of the last payload of the curves
         self._no_forecast = no_forecast(cell.no_forecast_reason)
         self._device_soc: float | None = None  # SOC that the device reported last
-        self._flow = ChargeEnergy()  # charge and energy as last published
+        self._charge_energy = ChargeEnergy()  # charge and energy as last published
         self.set_rate(settings.publish.rate_hz)
         self._window = Window()
         self._cells_sent_s = -math.inf  # time of the last comparison of the cells, monotonic clock
@@ -105,9 +105,7 @@ class Publisher:
         self._due_s = self._started_s
         self._last_sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
-        self._dropped_before = (
-            self._dropped_counts()
-        )  # number of dropped samples by kind when the last sample was accepted
+        self._dropped_before = self._dropped_counts()  # by kind, when the last sample was accepted
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -123,18 +121,18 @@ class Publisher:
         """Time until a snapshot is overdue, which shows that no samples arrive [s]."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
-    def add(self, received: ReceivedSamples, step: RunResult, cells_fault: str = "") -> None:
+    def add(self, received: ReceivedSamples, result: RunResult, cells_fault: str = "") -> None:
         """Add received samples and their estimates; publish if a snapshot is due or an alarm has changed.
 
         Args:
             received: Samples and cell voltages.
-            step: Result of the samples.
+            result: Result of the samples.
             cells_fault: Reason why the cell voltages cannot be used (``CellSlots.fault``); empty if they can.
         """
-        self.add_estimates(received, step)
-        self.add_to_alarms(received, step, cells_fault)
+        self.add_estimates(received, result)
+        self.add_to_alarms(received, result, cells_fault)
 
-    def add_estimates(self, received: ReceivedSamples, step: RunResult) -> bool:
+    def add_estimates(self, received: ReceivedSamples, result: RunResult) -> bool:
         """Add the estimates without evaluating the alarms. Return True if a snapshot was published.
 
         ``add_to_alarms`` evaluates the alarms later, so that they do not delay the estimate. It also publishes the first snapshot,
@@ -142,7 +140,7 @@ class Publisher:
         """
         if self._status.source_health:
             self._latency.add(self._status.source_health().block_age_s)
-        now_s, trace = self._clock.monotonic(), step.trace
+        now_s, trace = self._clock.monotonic(), result.trace
         if trace.size:
             self._window.add(trace, self._clock.wall(), received.cells_v, received.probes)
             self._last_sample_s = now_s
@@ -156,10 +154,10 @@ class Publisher:
         self._publish_snapshot(now_s)
         return True
 
-    def add_to_alarms(self, received: ReceivedSamples, step: RunResult, cells_fault: str = "") -> None:
+    def add_to_alarms(self, received: ReceivedSamples, result: RunResult, cells_fault: str = "") -> None:
         """Evaluate the alarms of the samples that were passed to ``add_estimates``."""
         now_s = self._clock.monotonic()
-        alarm_changed = self.alarm_monitor.add(received, step, now_s, cells_fault)
+        alarm_changed = self.alarm_monitor.add(received, result, now_s, cells_fault)
         if not self.latest and now_s >= self._due_s:
             self.publish()
         elif alarm_changed:
@@ -254,7 +252,9 @@ class Publisher:
 
     def _make_estimate(self, window: WindowSummary, wall_s: float) -> Estimate:
         # only saved values are published, so that the next run continues from the published ones
-        self._flow = self._flow.at_least(self._status.saved_flow or self._totals.charge_energy)
+        self._charge_energy = self._charge_energy.at_least(
+            self._status.saved_charge_energy or self._totals.charge_energy
+        )
         capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:
@@ -265,7 +265,7 @@ class Publisher:
             forecast,
             self._source.counters,
             wall_s,
-            self._flow,
+            self._charge_energy,
             capacity_ah,
             estimate_fields(self._pack),
             self._device_soc,

@@ -13,9 +13,9 @@ from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service.hook import Hook
 from bms_estimator.settings.alarms import AlarmHook
 
-RELAY_S = 2.0
+COMMAND_INTERVAL_S = 2.0
 """Interval between two relay commands [s]. A command holds only until the board is reset or replaced."""
-RELAY_RETRY_S = 0.5
+COMMAND_RETRY_S = 0.5
 """Interval between attempts after a failed relay command [s]."""
 RESET_POLL_S = 0.1
 """Interval between two checks for a reset of the board [s]."""
@@ -139,7 +139,7 @@ class RelayHook(Hook):
         return (self.settings.relay == "high") == bool(self._raised)
 
     def _on_transition(self, alarm: Alarm) -> None:
-        """Follow the alarms regardless of the hook's ``on``."""
+        """Log a change of the level. The setting ``on`` does not apply to a relay."""
         if self._raised.keys() - {alarm.name}:  # another alarm is raised, so that the level does not change
             return
         state = "raised" if self._raised else "cleared"
@@ -162,7 +162,7 @@ class RelayHook(Hook):
             command_error = await self._send_level()
             self._check_resets()  # a reset after the command undoes it
             self._set_error(self._reset_error() or command_error)
-            await self._wait(RELAY_RETRY_S if command_error else RELAY_S)
+            await self._wait(COMMAND_RETRY_S if command_error else COMMAND_INTERVAL_S)
 
     def _check_resets(self) -> None:
         resets = self._hold.check(self._board.boots, self._clock())

@@ -22,11 +22,18 @@ class RequestHandlers:
     Args:
         pack: The pack.
         publisher: Publisher of the pack.
-        zero_board: Makes the board store the present current as zero; None: the source has no such command.
+        store_current_zero: Makes the board store the present current as zero; None: the source has no such command.
     """
 
-    def __init__(self, pack: Pack, publisher: Publisher, zero_board: Callable[[], Awaitable[None]] | None) -> None:
-        self._pack, self._estimator, self._publisher, self._zero_board = pack, pack.estimator, publisher, zero_board
+    def __init__(
+        self, pack: Pack, publisher: Publisher, store_current_zero: Callable[[], Awaitable[None]] | None
+    ) -> None:
+        self._pack, self._estimator, self._publisher, self._store_current_zero = (
+            pack,
+            pack.estimator,
+            publisher,
+            store_current_zero,
+        )
 
     def register(self, requests: RequestDispatcher) -> None:
         """Register all handlers."""
@@ -63,11 +70,11 @@ class RequestHandlers:
         Raises:
             UserError: The pack is not at rest, or the source has no such command.
         """
-        if self._zero_board is None:
+        if self._store_current_zero is None:
             raise UserError("this source has no zero to be set")
         if self._publisher.not_at_rest_reason:
             raise UserError(self._publisher.not_at_rest_reason)
-        await self._zero_board()
+        await self._store_current_zero()
         log.info("present current taken as zero on request")
         return {}
 

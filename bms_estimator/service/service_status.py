@@ -77,5 +77,5 @@ class ServiceStatus:
     """Free space in the state folder [MiB]."""
     log_lines_lost: int = 0
     """Number of log lines dropped since start."""
-    saved_flow: ChargeEnergy | None = None
+    saved_charge_energy: ChargeEnergy | None = None
     """Saved charge and energy; None if they are not saved."""

@@ -90,7 +90,7 @@ class PublisherRecognition:
         return [_device(p, complete[p], broker, only_changes=self._sends_only_changes(p)) for p in best]
 
     def _sends_only_changes(self, publisher: Publisher) -> bool:
-        """Return True if voltage or current arrived often, no live value was repeated, and most values arrived only as retained ones."""
+        """Return True if voltage or current arrived several times, no live value was repeated, and most values were only retained."""
         live = self._live.get(publisher, {})
         repeated = any(a == b for payloads in live.values() for a, b in itertools.pairwise(payloads))
         is_frequent = max((len(live.get(name, ())) for name in ("voltage", "current")), default=0) >= MIN_LIVE_MESSAGES

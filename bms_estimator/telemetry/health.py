@@ -31,13 +31,13 @@ from bms_estimator.pack_model.history import DAY_S
 from bms_estimator.pack_model.slow_fit import SlowFit
 
 CONTRADICTION_STD, AGREEMENT_STD = 3.0, 2.0
-"""Difference between the estimate and the SOC by the device above which ``DEVICE_SOC`` is suspected, and below which it is no longer
-suspected, in standard deviations of the difference."""
-DEVICE_SOC = (
+"""Difference between the estimated SOC and the SOC of the device above which a contradiction is reported, and below which it is
+no longer reported, in standard deviations of the difference."""
+DEVICE_SOC_SUSPICION = (
     "the SOC that the device reports contradicts the voltage: check that the OCV curve belongs to this cell's chemistry, the number of "
     "cells in series and the sign of the current; a device that counts charge is also wrong long after its last full charge"
 )
-"""Suspicion of the chemistry, by the SOC of the device."""
+"""Text of this report in the field ``suspects`` of ``health``."""
 
 
 class FitTimes(NamedTuple):
@@ -208,18 +208,18 @@ def make_health_payload(
         uptime_s: Time since the service started [s].
         loop_lag_s: Longest delay of the event loop since the last report [s].
         restarts: Starts that found files of an earlier run.
-        checkpoint: Result of restoring the last checkpoint.
+        checkpoint: Result of the last attempt to restore or save the checkpoint.
         sensor_message: Reason why no fresh values arrive; None while fresh values arrive.
         delivery: Counters of sent messages and received requests.
         clock_ppm: Drift of the board's clock relative to the host [1e-6]; None if unknown.
-        total: Totals over restarts.
+        total: Running totals of all runs.
         unseen_s: Length of the last gap without samples [s]; None if there was none or it is unknown.
         loop: Delays of the event loop.
         recording: State of the recording; None: nothing is recorded.
         edge: State of the fleet edge; None without an edge.
         hooks: Successes and failures of alarm hooks; None without hooks.
         pack_model: State of the slow fit; None without a slow fit.
-        contradicts_device: True: ``DEVICE_SOC`` is suspected.
+        contradicts_device: True: ``suspects`` contains ``DEVICE_SOC_SUSPICION``.
     """
     state = record["observer"]
     return Health(
@@ -235,7 +235,7 @@ def make_health_payload(
         line={name: int(count) for name, count in source_counters.items() if name != "reconnects"},
         samples=sample_counters(state),
         identifier=identifier_counters(record),
-        suspects=suspicions(record, settings) + [DEVICE_SOC] * contradicts_device,
+        suspects=suspicions(record, settings) + [DEVICE_SOC_SUSPICION] * contradicts_device,
         anchor=last_anchor(record),
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),
@@ -287,7 +287,7 @@ def out_of_range_reason(block: SampleBlock, settings: np.void) -> str | None:
     ):
         if low_v <= corrected_v <= high_v and abs(corrected_a) <= max_a:
             return f"{text}: {question}"
-    fewest, most = math.ceil(volt / high_v), math.floor(volt / low_v)
-    if 1 < fewest <= min(most, MAX_SERIES_FACTOR) and abs(ampere) <= max_a:
-        return f"{text}: are there {fewest} to {most} times as many cells in series (pack.series)?"
+    min_factor, max_factor = math.ceil(volt / high_v), math.floor(volt / low_v)
+    if 1 < min_factor <= min(max_factor, MAX_SERIES_FACTOR) and abs(ampere) <= max_a:
+        return f"{text}: are there {min_factor} to {max_factor} times as many cells in series (pack.series)?"
     return text

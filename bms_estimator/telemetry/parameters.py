@@ -74,8 +74,8 @@ CONFIGURED_REASON = "from the cell file: no data has identified it"
 MOVED_REASON = "moved by the adaptive law of the thesis, which does not identify it"
 """Reason why a value that a law of the thesis has changed is not valid."""
 MOVED_RATIO = 1e-6
-"""Relative change above which a law of the thesis has changed a value of the cell file. Near its limit, (3.18) changes it
-less."""
+"""Minimum relative difference from the cell file of a value that a law of the thesis has changed. (3.18) changes a value near
+its limit by less."""
 LEARNED_REASON = "learned by the adaptive law, which gives no std"
 """Reason why a value of the learning law is not valid."""
 CAPACITANCE_PARAMETERS = range(7, 13)
@@ -141,9 +141,9 @@ def _battery_report(estimator: Estimator, cell: CellModel, now_s: float) -> Para
             if i in CAPACITANCE_PARAMETERS:
                 parameters[f"a{i}"] = _with_tau_validity(parameters[f"a{i}"], estimator)
     for e, name in enumerate(ELEMENT_NAMES):  # each element has three parameters, from a1 on
-        own = slice(3 * e + 1, 3 * e + 4)
-        reason = next((each for each in unlearned_reason[own] if each != CONFIGURED_REASON), CONFIGURED_REASON)
-        elements[name] = _mark_source(_with_reason(elements[name], reason), from_data[own].any(), learning)
+        indices = slice(3 * e + 1, 3 * e + 4)
+        reason = next((each for each in unlearned_reason[indices] if each != CONFIGURED_REASON), CONFIGURED_REASON)
+        elements[name] = _mark_source(_with_reason(elements[name], reason), from_data[indices].any(), learning)
     if estimator.has_filter:
         for name, identified in present_elements(record).items():
             elements[name] = _select_parameter(identified, elements[name], VALID_STD, now_s)
@@ -317,7 +317,7 @@ def _select_parameter(learned: IdentifiedValue, observer_value: Parameter, limit
     if observer_value.value is None:
         return observer_value
     reason = f"identified to {learned.relative_std:.0%} so far, valid below {limit:.0%}"
-    # std of the observer's value as an estimate of the true one: std and distance of the learned value
+    # the observer's value deviates from the true one by the std of the learned value and the distance to it
     std = math.hypot(learned.std, learned.value - observer_value.value)
     return observer_value.model_copy(update={"std": finite(std), "reason": reason})
 

@@ -7,7 +7,7 @@ from bms_estimator.model.payloads.snapshot import Parameter
 from bms_estimator.telemetry.state import finite
 
 REASON = "by (4.2), step 3 of the thesis; includes errors of the OCV and of a1..a12, which std does not cover"
-"""Reason why the published parameters are not valid."""
+"""Reason why ``valid`` is False in the published parameters."""
 
 
 def settling_reason(settle_s: float) -> str | None:

@@ -175,7 +175,7 @@ def make_state_payload(
     forecast: Forecast,
     counters: Mapping[str, int],
     now_s: float,
-    flow: ChargeEnergy,
+    charge_energy: ChargeEnergy,
     capacity_ah: float | None,
     cell_fields: Mapping[str, Any] = MappingProxyType({}),
     device_soc: float | None = None,
@@ -188,7 +188,7 @@ def make_state_payload(
         forecast: The last forecast.
         counters: Counters of the source.
         now_s: Wall clock [s since 1970].
-        flow: Charge and energy at the terminals.
+        charge_energy: Charge and energy at the terminals.
         capacity_ah: Rated capacity of the pack [Ah]; None for a fuel cell.
         cell_fields: Fields about single cells (``weakest_cell_fields``).
         device_soc: SOC that the device reports, 0..1; None: not reported.
@@ -220,8 +220,8 @@ def make_state_payload(
         remaining_capacity_ah=finite(remaining_capacity_ah),
         **forecast_fields(forecast, float(window.last["time_s"])),
         **{**NO_CELL_FIELDS, **cell_fields},
-        **flow._asdict(),
-        equivalent_cycles=flow.charge_out_ah / capacity_ah if capacity_ah else None,
+        **charge_energy._asdict(),
+        equivalent_cycles=charge_energy.charge_out_ah / capacity_ah if capacity_ah else None,
         delta_configured=bool(last["delta_configured"]),
         adaptive_gain_k=last["k"],
         converged=bool(last["converged"]),

@@ -1,6 +1,6 @@
 """Capacity from rests with a known SOC (anchors), on cells that differ from the model.
 
-The cell files have errors of the size that they declare.
+The errors of the cell files have the standard deviations that the files declare.
 """
 
 import numpy as np
@@ -110,7 +110,7 @@ def test_a_rest_on_a_flat_curve_is_no_anchor() -> None:
         match=r"(?s)no capacity.*determines SOC to \+-0\.\d\d only, because the curve has a slope of 0\.\d{3} V",
     ):
         capacity_from(
-            simulate_capture(load_and_rests_a(0.3) * PHOSPHATE.capacity_ah / 3.0, PHOSPHATE, soc=0.6),
+            simulate_capture(load_and_rests_a(0.3) * PHOSPHATE.capacity_ah / OXIDE.capacity_ah, PHOSPHATE, soc=0.6),
             load_cell("lfp", 2.4),
         )
 
@@ -129,4 +129,4 @@ def test_captures_without_anchors_are_rejected_with_the_reason(current_a: np.nda
 
 
 def test_a_capture_with_one_sample_is_one_part_without_a_numpy_warning() -> None:
-    assert continuous_parts(simulate_capture(np.zeros(1)), 3.0) == [(0, 1)]
+    assert continuous_parts(simulate_capture(np.zeros(1)), OXIDE.capacity_ah) == [(0, 1)]

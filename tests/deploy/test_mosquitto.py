@@ -156,6 +156,7 @@ def tls_port(find_program, deploy, tmp_path) -> Iterator[int]:
         .replace("broker.lan", "localhost")
         .replace("house", "pack")
     )
+    # $new is set by the commands of the page: options of a new key
     commands += "openssl req -x509 $new -subj /CN=pack -keyout stranger.key -out stranger.crt\n"
     subprocess.run(["bash", "-ec", commands], cwd=tmp_path, check=True, capture_output=True)
     write_users(tmp_path, deploy, passwd)

@@ -72,7 +72,8 @@ async def reset_loop(folder: Path, relay: str) -> ResetLoop:
     readings = write_readings(folder / "readings.csv", [(0.0, LOAD_A, 25.9, 25.0)])
     pin, sink, stop = PinMonitor(), Collector(), asyncio.Event()
     with pytest.MonkeyPatch.context() as patch, SimavrBoard(readings, speed=10.0, relay=True) as board:
-        patch.setattr(relay_hook, "RELAY_S", 0.02)  # several commands between two resets of the accelerated board
+        # several commands between two resets of the accelerated board
+        patch.setattr(relay_hook, "COMMAND_INTERVAL_S", 0.02)
         patch.setattr(relay_hook, "RESET_POLL_S", 0.02)
         settings = Settings.model_validate(
             {

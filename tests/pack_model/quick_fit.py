@@ -14,7 +14,7 @@ LN_CAPACITY = -0.1
 LN_SERIES, LN_PAIRS = 0.3, 0.2
 """ln of the fitted over the file's series resistance, and over the resistances of the RC pairs."""
 UNKNOWNS = CURVE_NODES + DIRECTIONS * DIRECTION_NODES
-"""Number of unknowns of the OCV's error and of the error by direction."""
+"""Number of unknowns of the OCV's error and of the direction-dependent error."""
 CURVE_V = 0.01
 """Fitted correction of the OCV of one cell [V]."""
 

@@ -95,7 +95,7 @@ def test_a_pack_that_aged_before_the_history_may_differ_from_its_cell_file() -> 
 
 
 def test_variance_grows_with_use_and_time() -> None:
-    cell, aging = cell_curves(), Aging(by_use=0.3, by_time=0.1)
+    cell, aging = cell_curves(), Aging(use_std=0.3, time_std=0.1)
     rows = measured_rows(cell, days=6)
     intervals = Intervals(cell, rows)
     variance = AgingVariance(aging, cell, intervals)

@@ -606,7 +606,7 @@ async def test_after_a_suspend_the_relay_stays_open_until_new_samples_are_watche
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first samples after it are old, from the buffers of the port. The pack has become hot meanwhile."""
-    monkeypatch.setattr(relay_hook, "RELAY_S", relay_hook.RESET_POLL_S)
+    monkeypatch.setattr(relay_hook, "COMMAND_INTERVAL_S", relay_hook.RESET_POLL_S)
     now_s, board = 0.0, RecordingBoard()
     hooks, clock = AlarmHooks([AlarmHook.model_validate(HOOKS[0])], "pack", None, board), Clock(monotonic=lambda: now_s)
     files = StateFiles(tmp_path, SETTINGS, CELL)

@@ -26,7 +26,7 @@ from bms_estimator.mqtt.delivery_stats import DeliveryStats
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_monitor import AlarmMonitor
-from bms_estimator.service.live_loop import LAG_STEP_S, ServiceParts, run_estimation_loop
+from bms_estimator.service.live_loop import LAG_INTERVAL_S, ServiceParts, run_estimation_loop
 from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
@@ -457,5 +457,5 @@ async def test_the_lag_of_the_event_loop_is_published() -> None:
     async with run_loop() as run:
         await run.sink.until(lambda _: True)
         time.sleep(0.4)  # noqa: ASYNC251 - blocks the loop, as a slow disk or terminal would
-        await run.sink.until(lambda s: s.health.loop_lag_s > 0.4 - LAG_STEP_S)
+        await run.sink.until(lambda s: s.health.loop_lag_s > 0.4 - LAG_INTERVAL_S)
         await run.end()

@@ -13,7 +13,7 @@ from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples
-from bms_estimator.telemetry.health import DEVICE_SOC
+from bms_estimator.telemetry.health import DEVICE_SOC_SUSPICION
 from tests.scripted_source import Collector, ScriptedSource
 
 
@@ -41,7 +41,7 @@ def test_suspected_input_faults_are_logged_when_their_set_changes() -> None:
     assert later == [[], ["none"], []]
 
 
-@pytest.mark.parametrize(("chemistry", "suspects"), [("nmc", [DEVICE_SOC]), ("lfp", [])])
+@pytest.mark.parametrize(("chemistry", "suspects"), [("nmc", [DEVICE_SOC_SUSPICION]), ("lfp", [])])
 def test_a_wrong_chemistry_is_suspected_by_the_soc_of_the_device(chemistry: str, suspects: list[str]) -> None:
     """The samples are those of an LFP cell at rest for ten minutes, whose device reports 60 %."""
     settings = Settings.model_validate({"pack": {"cell": chemistry, "capacity_ah": 100.0, "device_soc_std": 0.1}})

@@ -44,7 +44,7 @@ class Board:
 @pytest.fixture(autouse=True)
 def fast_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten the intervals of the hook's loop, which has no clock of its own."""
-    for name in ("RELAY_S", "RELAY_RETRY_S", "RESET_POLL_S"):
+    for name in ("COMMAND_INTERVAL_S", "COMMAND_RETRY_S", "RESET_POLL_S"):
         monkeypatch.setattr(relay_hook, name, 0.001)
 
 

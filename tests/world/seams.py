@@ -71,7 +71,10 @@ class _PatchedModule:
         return getattr(self._module, name)
 
 
-LONGER_INTERVALS = (("service.live_loop", "LAG_STEP_S", 2.0), ("sources.serial.serial_source", "SEND_INTERVAL_S", 0.5))
+LONGER_INTERVALS = (
+    ("service.live_loop", "LAG_INTERVAL_S", 2.0),
+    ("sources.serial.serial_source", "SEND_INTERVAL_S", 0.5),
+)
 """Module, name and new value [s] of poll intervals. With the real ones, most of the simulation's time would be polling."""
 CACHED_FUNCTIONS = (("estimator.settings_records", "decay_table"),)
 """Module and name of pure, slow functions. Their results are cached, because each start of the service calls them again."""

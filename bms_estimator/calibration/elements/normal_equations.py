@@ -144,8 +144,10 @@ def normal_equations(
         target = np.r_[target, (residual_v[is_after_step] - residual_v[is_before_step]) * step_root_weight]
     miscount_column = np.zeros(target.size)  # weighted voltage change due to a miscount of 1; 0 for jumps
     miscount_column[: selected.sum()] = slope_v[selected] * (soc[selected] - soc[0]) * root_weight
-    miscount_cross = rows.T @ miscount_column
-    miscount_information = float(miscount_column @ miscount_column + 1.0 / COUNT_STD**2)
+    miscount_cross, miscount_information = (
+        rows.T @ miscount_column,
+        float(miscount_column @ miscount_column + 1.0 / COUNT_STD**2),
+    )
     miscount_vector = float(miscount_column @ target - miscount / COUNT_STD**2)
     return NormalEquations(
         information=rows.T @ rows - np.outer(miscount_cross, miscount_cross) / miscount_information,

@@ -36,7 +36,7 @@ from bms_estimator.sources.serial.port_list import NoPortError, PortBusyError, o
 from bms_estimator.sources.serial.serial_source import SerialSource
 
 CUTOFF_MARGIN_V = 0.02
-"""Distance of the default cut-off above the alarm for low voltage, per cell [V]."""
+"""Distance per cell between the limits of the test and the alarms, and between mean and single cells without alarms [V]."""
 DEFAULT_TAIL_C_RATE = 0.05
 """Charge current at which a charge ends by default, as a C-rate [1/h]."""
 DEFAULT_MAX_TEMPERATURE_C = 60.0
@@ -54,9 +54,9 @@ def pack_limits(settings: Settings, pack: CellModel) -> Limits:
     alarms = {alarm.name: alarm.limit for alarm in monitored_alarms(settings, pack)}
     grid_v = ocv_grid(pack)[0]
     margin_v = CUTOFF_MARGIN_V * cells
-    lowest_v = alarms["pack_under_voltage"] + margin_v if "pack_under_voltage" in alarms else float(grid_v[0])
+    min_cutoff_v = alarms["pack_under_voltage"] + margin_v if "pack_under_voltage" in alarms else float(grid_v[0])
     full_v = min(charge.full_voltage_v or float(grid_v[-1]), alarms.get("pack_over_voltage", math.inf))
-    cutoff_v = max(charge.cutoff_voltage_v or 0.0, lowest_v)
+    cutoff_v = max(charge.cutoff_voltage_v or 0.0, min_cutoff_v)
     return Limits(
         capacity_ah=pack.cell.capacity_ah,
         series_count=cells,
@@ -231,7 +231,7 @@ class _LiveTest:
         self._settings, self._test, self._recording, self._relay = settings, test, recording, relay
         self._end_s, self._last_arrival_s = end_s, last_arrival_s
         self._has_samples, self._done = asyncio.Event(), asyncio.Event()
-        self._block_s = -math.inf  # monotonic time of the last block
+        self._last_block_s = -math.inf  # monotonic time of the last block
         self._switch: LoadSwitch | None = None
 
     async def run(self) -> None:
@@ -286,7 +286,7 @@ class _LiveTest:
                 shift_s = start_time(self._end_s, self._last_arrival_s, time.time()) - float(samples["time_s"][0])
             samples["time_s"] += shift_s
             self._test.feed(samples, received.cells_v)
-            self._block_s = time.monotonic()
+            self._last_block_s = time.monotonic()
             self._has_samples.set()
             self._request_load()
             if self._test.is_done:
@@ -295,7 +295,7 @@ class _LiveTest:
 
     def _request_load(self) -> None:
         """Request the state of the load; it is disconnected if no samples arrive."""
-        is_fresh = time.monotonic() - self._block_s < STALE_S
+        is_fresh = time.monotonic() - self._last_block_s < STALE_S
         if self._switch:
             self._switch.request(self._test.load_on and is_fresh)
 

@@ -137,7 +137,7 @@ def _is_unwritten(path: Path) -> bool:
 
 
 def start_time(end_s: float, last_arrival_s: float, first_arrival_s: float) -> float:
-    """Return the time at which a recording begins on the joint clock [s].
+    """Return the time at which a recording begins on the joint clock [s], at least 1 ms after ``end_s``: times must increase.
 
     Args:
         end_s: Time of the last sample before, on the joint clock [s].

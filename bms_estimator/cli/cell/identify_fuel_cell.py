@@ -40,9 +40,9 @@ class IdentifiedParameter:
     std: float | None
     """Standard deviation in the parameter's unit; None if the data do not determine the parameter."""
     of_start: float
-    """Value in the file of --cell."""
+    """Initial value, from the file of --cell."""
     reason: str | None
-    """Reason for which the data do not determine the parameter."""
+    """Reason why the data do not determine the parameter."""
 
 
 def identify_fuel_cell(

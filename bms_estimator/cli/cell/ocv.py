@@ -126,7 +126,7 @@ def ocv(
         int | None,
         typer.Option(
             parser=whole(1),
-            help="number of cells in series; required for LFP packs; default: median voltage divided by 3.7 V, which is too high for LFP",
+            help="number of cells in series; required for LFP packs; default: median voltage divided by 3.7 V",
             show_default=False,
         ),
     ] = None,

@@ -156,7 +156,7 @@ async def fetch(nc: Client, pack: str, *, since_s: float = -math.inf, until_s: f
     Args:
         nc: Connection to the tenant's NATS account.
         pack: Name of the pack.
-        since_s: Beginning of the time span by the edge's clock [s since 1970].
+        since_s: Beginning of the time span on the edge's clock [s since 1970].
         until_s: End of the time span [s since 1970].
 
     Raises:

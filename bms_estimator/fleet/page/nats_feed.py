@@ -125,7 +125,7 @@ class FleetFeed:
                 view.packs.receive_parameters(_pack_name(message), message.data)
 
         async def hour(message: Msg) -> None:
-            view.packs.receive_hour(_pack_name(message), message.data)
+            view.packs.receive_hour_summary(_pack_name(message), message.data)
 
         async def worker(message: Msg) -> None:
             view.receive_worker(message.data, clock())
@@ -163,7 +163,7 @@ class FleetFeed:
         async def read() -> None:
             async for batch in read_stream(nc, subjects.HOURS_STREAM, subjects.hours(), since_s=since_s):
                 for message in batch:
-                    self._view.packs.receive_hour(message.subject.split(".")[1], message.data)
+                    self._view.packs.receive_hour_summary(message.subject.split(".")[1], message.data)
 
         await self._retry(read)
 

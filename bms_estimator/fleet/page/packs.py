@@ -107,9 +107,9 @@ class FleetPacks:
         self._row(name)
         self._parameters[name] = zlib.compress(parameters, 1)
 
-    def receive_hour(self, name: str, hour: bytes) -> None:
+    def receive_hour_summary(self, name: str, summary: bytes) -> None:
         """Store the input faults in the summary of a pack's hour."""
-        values = _object(hour)
+        values = _object(summary)
         suspects = values.get("suspects") if values else None
         if isinstance(suspects, int) and 0 <= suspects < 65_536:
             self._row(name)["suspects"] = suspects

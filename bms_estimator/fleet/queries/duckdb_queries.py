@@ -285,7 +285,7 @@ def _files_by_day(folder: Path) -> dict[Path, list[Path]]:
 def find_present(database: duckdb.DuckDBPyConnection, names: list[str], wall_hour: int) -> Present:
     """Return the present time. Usually only the statistics in the files are read.
 
-    A row that arrived after the present by the server's clock shows that a clock is wrong. It is this machine's clock if the
+    A row that arrived after the present on the server's clock shows that a clock is wrong. It is this machine's clock if the
     clocks of most edges are later, too; otherwise it is the server's, and the row's arrival is not used.
 
     Args:

@@ -69,7 +69,7 @@ worker releases a partition."""
 
 
 class DeliveredMessages:
-    """Delivered messages of one partition, as the block loop and the task of the partition process them.
+    """Queue of the delivered messages of one partition, which the block loop and the task of the partition process.
 
     Args:
         consumer: Consumer of the partition.

@@ -1,8 +1,8 @@
 """Order and plausibility of a pack's blocks, and replies to its edge. The order and the replies depend only on the received blocks.
 
-A reply names the first block that is not safe (``UnsavedPositions``). It confirms all earlier ones, which the edge may then
-delete.
-On request, the edge resends the named block and all later blocks. Therefore late, repeated and early blocks can be dropped.
+A reply names the first block that is not safe (``UnsavedPositions``). It confirms all earlier blocks, which the edge may then
+delete. On request, the edge resends the named block and all later blocks. Therefore late, repeated and early blocks can be
+dropped.
 
 A block is safe when two checkpoints that share no object include it, because then the damage of one object loses no block.
 Until then the stream may drop the block, for example while no worker runs and the stream is full. The edge must therefore be
@@ -168,7 +168,7 @@ server rejects the missing blocks, or they are damaged on the edge's disk."""
 
 
 class BlockOrder(Enum):
-    """Position of a block in the order of its pack."""
+    """Position of a block in the order of its pack. Except for ``NEXT``, the value is the name of the partition's counter."""
 
     NEXT = "next"
     RESENT = "resends"

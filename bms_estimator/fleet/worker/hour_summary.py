@@ -27,15 +27,15 @@ REST_C = 0.01
 """Maximum current of a resting pack, as a C-rate [1/h]."""
 
 SIGNIFICANT_STDS = 3.0
-"""Number of std that are subtracted from the deviation of a cell to select the weakest cell and the one with the highest
-resistance."""
+"""Number of std by which the deviation of a cell is reduced before the weakest cell, and the cell with the highest resistance,
+are selected, so that an uncertain estimate does not select its cell."""
 
 Sums = NDArray[np.void]
 """Shape (1,), dtype ``HOUR_SUMS``; all zero before the first block."""
 
 
 def hour_of(block: Block) -> int:
-    """Return the hour of a block by the edge's clock at its last sample [hours since 1970].
+    """Return the hour of a block on the edge's clock at its last sample [hours since 1970].
 
     A block whose last timestamp is not finite belongs to the hour in which its store was created.
     """

@@ -44,7 +44,9 @@ class PackAlarms:
         self._samples: SampleBlock = np.zeros(0, SAMPLE)  # last samples of the block
         self._impossible: list[str] = []  # descriptions of impossible values in ``_samples``
         self._has_events = False  # True if the block has changed the estimator in a way that is an event
-        self._cell_windows = self._fits = 0  # numbers of cell estimates and of fits before the block
+        self._cell_windows = self._fit_changes = (
+            0  # numbers of cell estimates and of ``SlowFit.changes`` before the block
+        )
 
     def begin_block(self, pack_type: PackType, *, is_new_time_base: bool) -> None:
         """Begin a block of the loaded pack.
@@ -58,7 +60,7 @@ class PackAlarms:
         self._evaluation.clear()
         self._has_events = False
         self._cell_windows = int(pack_type.cells.bank["windows"][0])
-        self._fits = pack_type.pack.slow_fit.changes if pack_type.pack.slow_fit else 0
+        self._fit_changes = pack_type.pack.slow_fit.changes if pack_type.pack.slow_fit else 0
 
     def add(
         self, pack_type: PackType, samples: SampleBlock, cells_v: CellBlock, trace: TraceBlock, wall_offset_s: float
@@ -72,9 +74,9 @@ class PackAlarms:
             trace: Their estimates.
             wall_offset_s: Wall clock of the edge minus the samples' clock [s].
         """
-        part, slow_fit = self._evaluation.io[0], pack_type.pack.slow_fit
-        part["wall_offset_s"], part["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
-        part["cells_at_s"], part["short_a"], part["reading_v"] = self._cell_values(pack_type)
+        io, slow_fit = self._evaluation.io[0], pack_type.pack.slow_fit
+        io["wall_offset_s"], io["weak_cell_std"] = wall_offset_s, slow_fit.weak_cell_std if slow_fit else math.nan
+        io["cells_at_s"], io["short_a"], io["reading_v"] = self._cell_values(pack_type)
         self._has_events |= self._evaluation.run(
             self._alarms, pack_type.alarms, self._estimator, samples, cells_v, trace
         )
@@ -83,7 +85,7 @@ class PackAlarms:
             pack_type.alarms.bounds.describe(
                 name, samples[row - 1], cells_v[row - 1] if len(cells_v) == samples.size else NO_CELLS
             )[1]
-            for name, row in zip(QUANTITIES, part["impossible"].tolist(), strict=True)
+            for name, row in zip(QUANTITIES, io["impossible"].tolist(), strict=True)
             if row
         ]
 
@@ -118,7 +120,8 @@ class PackAlarms:
         """
         slow_fit = pack_type.pack.slow_fit
         entries = self._evaluation.entries
-        if not (entries.size or self._has_events or include_unchanged or (slow_fit and slow_fit.changes > self._fits)):
+        has_fit_change = slow_fit and slow_fit.changes > self._fit_changes
+        if not (entries.size or self._has_events or include_unchanged or has_fit_change):
             return ()
         positions = set(entries["alarm"].tolist())
         if include_unchanged:
@@ -169,7 +172,7 @@ class PackAlarms:
     def _events(self, pack_type: PackType) -> Iterator[EventText]:
         """Yield the events since the last call, except those of alarms."""
         slow_fit, record = pack_type.pack.slow_fit, self._estimator[0]
-        if slow_fit and slow_fit.changes > self._fits and (change := last_change(slow_fit)):
+        if slow_fit and slow_fit.changes > self._fit_changes and (change := last_change(slow_fit)):
             yield fit_event(change)
         reported = dict(zip(COUNTS.names or (), self._alarms[0]["reported"].item(), strict=True))
         former_faults = [fault.text for fault in InputFault(reported["suspects"])]
@@ -186,11 +189,9 @@ class PackAlarms:
         if cells is not None and name in ("cell_short", "cell_sensor_fault"):
             faults = cell_alarm_inputs(cells)
             yield from (faults.short if name == "cell_short" else faults.reading).texts
-        own = {"sensor_fault": SENSOR_SUSPECTS, "model_mismatch": MODEL_SUSPECTS}.get(name, InputFault(0)) & InputFault(
-            int(self._estimator["checks"]["suspects"][0])
-        )
-        if own:
-            yield from suspect_texts(own, suspicions(self._estimator[0], pack_type.estimator.settings_record[0]))
+        kinds = {"sensor_fault": SENSOR_SUSPECTS, "model_mismatch": MODEL_SUSPECTS}.get(name, InputFault(0))
+        if suspects := kinds & InputFault(int(self._estimator["checks"]["suspects"][0])):
+            yield from suspect_texts(suspects, suspicions(self._estimator[0], pack_type.estimator.settings_record[0]))
 
     def _input_faults(self) -> Iterator[str]:
         """Yield the faults of the last samples, one sentence each."""

@@ -109,7 +109,7 @@ class PartitionLease:
         self._delivered = DeliveredMessages(
             self.consumer, self._guard, self.results, block_loop, self._process_next, self._try
         )
-        self._silent = False  # the stream must be searched, because no message has arrived
+        self._is_search_due = False  # True: the stream must be searched, because no message has arrived
         self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
 
     @property
@@ -140,7 +140,7 @@ class PartitionLease:
         The caller calls this method about once a second.
         """
         if time.monotonic() >= self._delivered.next_search_s:
-            self._silent = True
+            self._is_search_due = True
             self._delivered.wake_up()
         self._deferred.wake_up()
         self._changes.wake_up()
@@ -160,8 +160,8 @@ class PartitionLease:
             if self.consumer.waiting and not delivered.can_process_next():
                 await self._process_delivered(self.consumer.pop())
                 delivered.postpone_search()
-            elif self._silent and not self.consumer.waiting:
-                self._silent = False
+            elif self._is_search_due and not self.consumer.waiting:
+                self._is_search_due = False
                 delivered.postpone_search()
                 await self._try(self._read_undelivered)
             else:

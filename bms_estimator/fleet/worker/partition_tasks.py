@@ -48,7 +48,7 @@ class DeferredReader:
         self._wake_up.set()
 
     async def run(self) -> None:
-        """Process deferred messages until cancelled, one of each pack at a time."""
+        """Process deferred messages until cancelled, one message of each pack in turn."""
         while True:
             self._wake_up.clear()
             while (partition := self._owned_partition()) and (due := partition.deferred.next(self._is_due)):

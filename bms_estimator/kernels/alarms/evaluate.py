@@ -100,9 +100,8 @@ def evaluate(
     if trace.shape[0]:
         _evaluate_estimates(a, limits, p, b, trace, cutoff_risk, e.checks.suspects & p.model_suspects != 0, log)
     if not math.isnan(b.weak_cell_std) and not math.isnan(end_s):
-        step_s = step_intervals(a.bank, end_s, math.inf)[
-            1
-        ]  # gaps count toward the delay, because a weak cell remains weak
+        # gaps count toward the delay, because a weak cell remains weak
+        step_s = step_intervals(a.bank, end_s, math.inf)[1]
         update(states[WEAK_CELL], limits[WEAK_CELL], p, b, log, WEAK_CELL, end_s, step_s, b.weak_cell_std, 0)
     if not math.isnan(b.cells_at_s):
         step_s = step_intervals(a.cells, b.cells_at_s, CELLS_GAP_S)[1]
@@ -215,7 +214,8 @@ def _evaluate_inputs(a: Record, limits: Records, p: Record, b: Record, e: Record
     is_first = not a.fraction.started
     if not is_first and 0.0 <= at_s - a.fraction.last_s < FRACTION_S:
         return
-    step_s = step_intervals(a.fraction, at_s, math.inf)[1]  # losses are counted in gaps, too
+    # gaps count toward the delay, because losses are also counted in gaps
+    step_s = step_intervals(a.fraction, at_s, math.inf)[1]
     o = e.observer
     unusable = o.dropped_not_finite + o.dropped_range + o.dropped_saturated + b.lost
     good, bad = o.samples - a.accepted, unusable - a.unusable

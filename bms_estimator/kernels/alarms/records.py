@@ -123,10 +123,8 @@ SETTINGS = np.dtype(
         ("charging_a", "f8"),  # minimum current that counts as charging [A]
         ("series", "f8"),  # cells in series
         ("max_a", "f8"),  # highest current that the pack can have; a higher one is a faulty input [A]
-        (
-            "range_a",
-            "f8",
-        ),  # highest current of usual loads; limit if the voltage shows that the source sends mV and mA [A]
+        # highest current of usual loads; also the limit of a current whose voltage shows that the source sends mV and mA [A]
+        ("range_a", "f8"),
         ("low_v", "f8"),  # lowest and highest usual voltage of the pack [V]
         ("high_v", "f8"),
         # voltages beyond which a wire may be broken, so that the alarm of the opposite limit is uncertain [V]
@@ -142,10 +140,8 @@ SETTINGS = np.dtype(
 EVALUATION_IO = np.dtype(
     [
         ("wall_offset_s", "f8"),  # wall clock minus the samples' clock [s]
-        (
-            "cells_at_s",
-            "f8",
-        ),  # time of a new estimate of the single cells [s]; NaN: no new one, and the next two fields are not used
+        # time of a new estimate of the single cells [s]; NaN: no new one, and the next two fields are not used
+        ("cells_at_s", "f8"),
         ("short_a", "f8"),  # largest proven self-discharge of a cell [A]
         ("reading_v", "f8"),  # largest error of the measured voltage of a cell [V]
         ("weak_cell_std", "f8"),  # deviation of a bank's last discharge from its reference [std]; NaN: unknown

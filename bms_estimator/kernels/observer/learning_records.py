@@ -15,7 +15,7 @@ LEARNING_SETTINGS = np.dtype(
         ("enabled", "i8"),  # 0: an adaptive law of the thesis is used instead
         ("model", "i8"),  # kernels.observer.learning_model.Model
         ("count", "i8"),  # number of identified parameters
-        ("file", "f8", CONSTANTS),  # values at theta = 0
+        ("file", "f8", CONSTANTS),  # parameters of the cell file, which theta = 0 denotes
         ("lower", "f8", LEARNABLE),  # bounds of theta
         ("upper", "f8", LEARNABLE),
         ("middle", "f8", LEARNABLE),  # theta that the leakage approaches
@@ -25,7 +25,7 @@ LEARNING_SETTINGS = np.dtype(
         ("settle_s", "f8"),  # time after which effects of unknown initial states have decayed [s]
         ("rate", "f8"),  # gamma: rate at which theta follows the data, at k = 1 [1/s]
         ("cells", "f8"),  # cells in series; k grows with the error of one cell
-        ("told_v", "f8"),  # sensitivity above which the data count as informative [V]
+        ("told_v", "f8"),  # norm of psi above which the data count as informative [V]
         ("reach", "f8"),  # trust region of theta: maximum step for which the sensitivities are valid
         ("soc_floor", "f8"),  # SOC below which learning is disabled (erratum 14)
     ],

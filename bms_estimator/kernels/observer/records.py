@@ -45,7 +45,7 @@ OBSERVER_SETTINGS = np.dtype(
         ("check_v", "f8"),  # ohmic drop up to which a change of the current is not checked [V]
         # A longer step is a gap, unless it is at most GAP_RATIO times the previous step [s]
         ("gap_s", "f8"),
-        ("unmeasured_s", "f8"),  # longest step over which the charge is integrated from the currents at its ends [s]
+        ("unmeasured_s", "f8"),  # longest step over which the current is interpolated between samples [s]
     ],
     align=True,
 )

@@ -51,7 +51,7 @@ def initialize_series_resistance(s: Record, p: Record) -> None:
 
 @njit(cache=True)
 def current_suffices(current_a: float, p: Record) -> bool:
-    """Return True if (4.2) can be evaluated at a current; ``p`` is a record of ESTIMATOR_SETTINGS."""
+    """Return True if a current is large enough for (4.2); ``p`` is a record of ESTIMATOR_SETTINGS."""
     return abs(current_a) > MIN_CURRENT_C * p.observer.capacity_as / 3600.0
 
 

@@ -217,7 +217,9 @@ def apply_hello(d: Record, s: Record) -> None:
         reset_readings(s)
     d.boot_id, d.serial = boot_id, serial
     d.period_us = read_unsigned(p, 22, 4) * 1e-3
-    s.full_scale = float(1 << min(read_unsigned(p, 26, 1), 24))
+    s.full_scale = float(
+        1 << min(read_unsigned(p, 26, 1), 24)
+    )  # an implausible number of bits must not overflow the shift
     channels = read_unsigned(p, 27, 1)
     s.ntc_fitted = channels & 1
     s.ratiometric = channels >> 1 & 1

@@ -20,7 +20,7 @@ BAUD = 500_000
 RATE_HZ = range(1, 1001)
 """Valid sample rates [Hz]."""
 MIN_BANDGAP_V, MAX_BANDGAP_V = 1.0, 1.2
-"""Range of the internal reference of an ATmega328P by its data sheet [V]."""
+"""Range of the internal reference of an ATmega328P according to its data sheet [V]."""
 MIN_DIVIDER, MAX_DIVIDER = 1.0, 100.0
 """Range of the voltage divider's ratio."""
 MIN_VOLTS_PER_AMPERE, MAX_VOLTS_PER_AMPERE = 0.001, 2.0
@@ -84,7 +84,7 @@ class ResetCause(IntFlag):
 
 
 class ProtocolError(ValueError):
-    """The bytes are not a message of this protocol."""
+    """Error of bytes that are not a message of this protocol."""
 
 
 def seal(packet: bytes) -> bytes:
@@ -115,12 +115,12 @@ def command(message_type: MessageType, body: bytes = b"") -> bytes:
 
 
 def hello_command() -> bytes:
-    """Build the command to send the hello."""
+    """Build the command that requests the hello."""
     return command(MessageType.COMMAND_HELLO)
 
 
 def set_rate_command(rate_hz: int) -> bytes:
-    """Build the command to set the sample rate.
+    """Build the command that sets the sample rate.
 
     Raises:
         ValueError: The rate is outside 1..1000 Hz.
@@ -131,48 +131,48 @@ def set_rate_command(rate_hz: int) -> bytes:
 
 
 def zero_current_command() -> bytes:
-    """Build the command to take the present current as zero, stored permanently."""
+    """Build the command that permanently stores the present current as zero."""
     return command(MessageType.COMMAND_ZERO_CURRENT)
 
 
 def set_serial_command(serial: int) -> bytes:
-    """Build the command to store a serial number, 1..2^32 - 1."""
+    """Build the command that stores a serial number, 1..2^32 - 1."""
     return command(MessageType.COMMAND_SET_SERIAL, struct.pack("<I", serial))
 
 
 def set_bandgap_command(bandgap_v: float) -> bytes:
-    """Build the command to set the measured internal reference [V], 1.0..1.2, stored permanently."""
+    """Build the command that permanently stores the measured internal reference, 1.0..1.2 [V]."""
     return command(MessageType.COMMAND_SET_BANDGAP, struct.pack("<I", round(bandgap_v * 1e6)))
 
 
 def set_divider_command(divider: float) -> bytes:
-    """Build the command to set the divider ratio, 1..100, stored permanently."""
+    """Build the command that permanently stores the divider ratio, 1..100."""
     return command(MessageType.COMMAND_SET_DIVIDER, struct.pack("<I", round(divider * 1e6)))
 
 
 def set_current_slope_command(volts_per_ampere: float) -> bytes:
-    """Build the command to store the slope of the current sensor [V/A], 0.001..2; for a ratiometric sensor at 5 V."""
+    """Build the command that stores the slope of the current sensor, 0.001..2; for a ratiometric sensor, that at 5 V [V/A]."""
     return command(MessageType.COMMAND_SET_CURRENT_SLOPE, struct.pack("<I", round(volts_per_ampere * 1e6)))
 
 
 def set_ratiometric_command(ratiometric: int) -> bytes:
-    """Build the command to store whether the slope of the current sensor is proportional to the supply: 0 or 1."""
+    """Build the command that stores 1 if the slope of the current sensor is proportional to the supply, otherwise 0."""
     return command(MessageType.COMMAND_SET_RATIOMETRIC, struct.pack("<I", ratiometric))
 
 
 RELAY_KEEP, RELAY_LOW, RELAY_HIGH = range(3)
-"""Fallback level of the relay when the host is silent."""
+"""Codes of the relay's fallback level, which it takes when the host is silent."""
 MAX_SILENT_S = 3600
 """Maximum delay of the fallback level [s]."""
 
 
 def set_relay_command(relay: Relay) -> bytes:
-    """Build the command to set the relay pin."""
+    """Build the command that sets the relay pin."""
     return command(MessageType.COMMAND_SET_RELAY, struct.pack("<I", relay_word(relay)))
 
 
 def relay_word(relay: Relay) -> int:
-    """Encode the relay command: bit 0 the level, bits 8 and 9 the fallback, the upper half its delay [s]."""
+    """Encode the relay command: level in bit 0, fallback level in bits 8 and 9, and its delay [s] in the upper half."""
     fallback = RELAY_KEEP if relay.high_when_silent is None else RELAY_HIGH if relay.high_when_silent else RELAY_LOW
     return relay.high | fallback << 8 | relay.silent_s << 16
 

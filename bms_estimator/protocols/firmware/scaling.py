@@ -78,7 +78,10 @@ def add_bandgap(s: Record, total: float, count: float, board_us: int) -> None:
 
 @njit(cache=True)
 def add_ntc(s: Record, total: float, count: float, board_us: int) -> None:
-    """Update the filtered mean of the NTC. A reading of an open or shorted NTC resets it, because the mean would be plausible."""
+    """Update the filtered mean of the NTC.
+
+    A reading of an open or shorted NTC resets the mean, because a mean of valid and invalid readings would be plausible.
+    """
     if not _RAIL < total / count / s.full_scale < 1.0 - _RAIL:
         s.ntc_mean = s.ntc_weight = 0.0
         return

@@ -72,7 +72,7 @@ class CaptureHeader:
     baud: int = 0
     current_sign: str = "discharge_positive"
     started: str = ""
-    """Start of the recording by the wall clock, ISO 8601 UTC; empty: set by the writer."""
+    """Wall clock at the start of the recording, ISO 8601 UTC; empty: set by the writer."""
     version: int = VERSION
     address: int | None = None
     """Address of the recorded pack, if the line had several."""

@@ -218,7 +218,7 @@ class Replay:
 
     @property
     def _device_soc(self) -> Floats:
-        """SOC of the last block by the device, which only a raw capture has."""
+        """SOC that the device reported in the last block, which only a raw capture has."""
         return self._decoder.device_soc if self._decoder else NO_SOC
 
     def _advance(self, before: float, fraction_of_block: float) -> None:
@@ -270,7 +270,7 @@ def open_capture(
     current_sign: CurrentSign | None = None,
     column_map: ColumnMap | None = None,
 ) -> Capture:
-    """Open a capture: a raw capture or a table, by its content.
+    """Open a capture. The content of the file shows whether it is a raw capture or a table.
 
     Args:
         path: The file.

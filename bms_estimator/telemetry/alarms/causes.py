@@ -27,13 +27,13 @@ class Causes:
 
     Attributes:
         input_faults: Faults of the input that ``sensor_fault`` describes.
-        board: Reason why the board's resets raise ``sensor_fault``; empty if they do not.
+        board_fault: Reason why the board's resets raise ``sensor_fault``; empty if they do not.
         unwatched: Alarms that cannot be watched, each with the reason.
         unknown: Alarms whose value is not known, each with the reason.
     """
 
     def __init__(self) -> None:
-        self.input_faults, self.board = FaultTexts(), ""
+        self.input_faults, self.board_fault = FaultTexts(), ""
         self.unwatched: Mapping[AlarmName, str] = {}
         self.unknown: Mapping[AlarmName, str] = {}
         self._lost: tuple[Quantity, ...] = ()
@@ -97,7 +97,7 @@ class Causes:
         reasons = self._texts.get(name, ())
         if name == "sensor_fault":
             faults = (text for quantity, text in self.input_faults.texts.items() if quantity not in self._lost)
-            board = (self.board,) if self.board else ()
+            board = (self.board_fault,) if self.board_fault else ()
             reasons = (*(self._loss_text(each) for each in self._lost), *faults, *board, *reasons)
         return AlarmMessage(
             raised,

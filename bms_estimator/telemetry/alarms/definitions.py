@@ -114,7 +114,9 @@ class EvaluationKernel:
         """
         if self._scratch.shape[1] < samples.size:
             self._scratch = np.zeros((6, samples.size))
-        rows = int(self.io["logged"][0]) + _MAX_CHANGES_PER_SAMPLE * (samples.size + 1)  # + 1: alarms evaluated once
+        rows = int(self.io["logged"][0]) + _MAX_CHANGES_PER_SAMPLE * (
+            samples.size + 1
+        )  # + 1: alarms evaluated once a call
         if self.log.size < rows:
             self.log = np.concatenate((self.entries, np.empty(rows, LOG)))
         return evaluate(

@@ -55,7 +55,7 @@ class AlarmEvaluator:
         self._alarms = AlarmList(AlarmDefinitions.of(monitored_alarms(settings, model), settings, model, gap_s))
         self._estimator, self._probe_faults = estimator, ProbeFaults()
         self._lost_s, self._silence_limit_s = settings.alarms.lost_s, silent_limit_s(settings)
-        self._silence_s = -math.inf  # end of the last silence on the monotonic clock [s]
+        self._silence_end_s = -math.inf  # end of the last silence on the monotonic clock [s]
 
     @property
     def is_watching(self) -> bool:
@@ -101,25 +101,25 @@ class AlarmEvaluator:
         alarms, causes = self._alarms, self._alarms.causes
         samples, was_faulty = self._probe_faults.add(samples, probes), alarms.is_raised("sensor_fault")
         self._set_suspects()
-        part, times_s = alarms.kernel.io, samples["time_s"]
+        io, times_s = alarms.kernel.io, samples["time_s"]
         if cells_fault:
             causes.input_faults.add("cells", cells_fault, cells_fault)
-        part["cells_unusable"] = bool(cells_fault)
-        alarms.record["faults"] |= (bool(cells_fault) << CELLS) | (bool(causes.board) << FAULTY_BOARD)
+        io["cells_unusable"] = bool(cells_fault)
+        alarms.record["faults"] |= (bool(cells_fault) << CELLS) | (bool(causes.board_fault) << FAULTY_BOARD)
         last_s = (
             times_s[-1] if math.isfinite(times_s[-1]) else np.append(alarms.at_s, times_s[np.isfinite(times_s)])[-1]
         )
-        part["wall_offset_s"], part["lost"], part["weak_cell_std"] = arrival_s - last_s, lost, weak_cell_std
-        part["cells_at_s"] = math.nan
+        io["wall_offset_s"], io["lost"], io["weak_cell_std"] = arrival_s - last_s, lost, weak_cell_std
+        io["cells_at_s"] = math.nan
         if cell_alarm_inputs:
             short, reading = cell_alarm_inputs.short, cell_alarm_inputs.reading
-            part["cells_at_s"], part["short_a"], part["reading_v"] = cell_alarm_inputs.at_s, short.value, reading.value
+            io["cells_at_s"], io["short_a"], io["reading_v"] = cell_alarm_inputs.at_s, short.value, reading.value
             causes.set_cell_fault("cell_short", short, is_raised=alarms.is_raised("cell_short"))
             causes.set_cell_fault("cell_sensor_fault", reading, is_raised=alarms.is_raised("cell_sensor_fault"))
         risk = np.ascontiguousarray(forecasts["cutoff_within_5min"])
         alarms.kernel.run(alarms.record, alarms.definitions, self._estimator.record, samples, cells_v, trace, risk)
         self._describe_faults(samples, cells_v, clock_fault)
-        if part["inputs_evaluated"][0]:
+        if io["inputs_evaluated"][0]:
             causes.input_faults.end_interval(keep=was_faulty or alarms.is_raised("sensor_fault"))
         if trace.size:
             causes.unknown = find_unknown(trace[-1], soc_known=bool(alarms.record["soc_known"][0]))
@@ -130,23 +130,22 @@ class AlarmEvaluator:
 
         alarms.take_changes(reason_at)
 
-    def on_silence(self, silent_s: float, now_s: float, reason: str, steady_s: float) -> None:
+    def on_silence(self, silent_s: float, now_s: float, reason: str, monotonic_s: float) -> None:
         """Handle missing samples.
 
         Args:
             silent_s: Time since the last sample on the monotonic clock [s].
             now_s: Wall clock [s since 1970].
             reason: Reason for the silence; empty if unknown.
-            steady_s: Monotonic clock [s].
+            monotonic_s: Monotonic clock [s].
         """
         alarms, is_silent = self._alarms, silent_s >= self._silence_limit_s
         if is_silent:
-            alarms.kernel.io["watched_s"], self._silence_s = math.nan, steady_s
-        elif (
-            alarms.silence_reason
-        ):  # due alarms are raised before the silence ends, so that a relay does not close in between
-            # the first samples may have waited in the buffers of a suspended process
-            is_silent = steady_s - self._silence_s < MIN_WATCHED_S or not self.is_watching
+            alarms.kernel.io["watched_s"], self._silence_end_s = math.nan, monotonic_s
+        elif alarms.silence_reason:
+            # Due alarms are raised before the silence ends, so that a relay does not close in between. The first samples may
+            # have waited in the buffers of a suspended process.
+            is_silent = monotonic_s - self._silence_end_s < MIN_WATCHED_S or not self.is_watching
         if is_silent != bool(alarms.silence_reason):
             alarms.set_silence((reason or "no samples arrive") if is_silent else "")
         definition = alarms.definitions.by_position.get(LINK_LOST)
@@ -181,9 +180,9 @@ class AlarmEvaluator:
             reason: Reason why the board's resets are a fault; empty if they are not.
             now_s: Wall clock [s since 1970].
         """
-        if reason == self._alarms.causes.board:
+        if reason == self._alarms.causes.board_fault:
             return
-        self._alarms.causes.board = reason
+        self._alarms.causes.board_fault = reason
         if reason:
             self._alarms.raise_at("sensor_fault", now_s)
 

@@ -25,7 +25,7 @@ Patch = tuple[ModuleType | type, str, object]
 """Module or class, the name of its attribute, and the attribute's value while the part is disabled."""
 ZERO = 1e-6
 """Std of a fixed unknown, because a std of 0 has no inverse. ``1 / ZERO`` serves as a limit that is never reached."""
-NO_AGING = Aging(by_use=0.0, by_time=0.0)
+NO_AGING = Aging(use_std=0.0, time_std=0.0)
 """Aging that leaves the quantity as it is."""
 FEW_ROWS = 400
 """Number of rows of a short history. Two weeks have fewer rows than the slow fit allows (``MAX_ROWS``), so that
@@ -136,7 +136,9 @@ PARTS: dict[str, Part] = {
     "slow fit": Part(has_slow_fit=False),
     "error of the OCV": Part(((prior, "curve_covariance", lambda _, soc: ZERO**2 * np.eye(soc.size)),)),
     "shift of the OCV along SOC": Part(((prior, "MAX_SLIP_FRACTION", 0.0),)),
-    "error by direction (independent noise instead)": Part((after_init(VoltageModel, count_direction_as_noise),)),
+    "direction-dependent error (independent noise instead)": Part(
+        (after_init(VoltageModel, count_direction_as_noise),)
+    ),
     "error of R over SOC": Part(((prior, "SHAPE_STD", ZERO),)),
     "error of R over temperature": Part(((prior, "ARRHENIUS_STD", ZERO),)),
     "temperature coefficient of the OCV": Part(((prior, "ENTROPY_STD_V", ZERO * prior.ENTROPY_STD_V),)),

@@ -13,6 +13,7 @@ from tests.calibration.simulated_relaxation import relaxation
 from tests.command_line import run
 
 TABLES = [str(n) for n in range(2, 14)]
+"""Numbers of the tables with recomputed values. Table 1 contains inputs."""
 FIGURES = [str(n) for n in (*range(3, 9), 10, *range(13, 18), *range(19, 24), *range(26, 40), 41, 42)]
 """Numbers of the drawn figures. Figure 9 is a block diagram."""
 RELAXATION, SLOW, FAST, STEPS = (
@@ -68,7 +69,7 @@ class ReportParser(HTMLParser):
         if tag == "article":
             self._article = None
         if tag in ("span", "p", "th", "article"):
-            self._field = "title" if self._field == "number" else None
+            self._field = "title" if self._field == "number" else None  # the title follows the number
 
     def handle_data(self, data):
         if self._article is None or self._field is None:
@@ -91,15 +92,15 @@ def report_text(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def page(report_text):
+def report(report_text):
     """Return the parsed report."""
     return ReportParser(report_text)
 
 
 @pytest.mark.thorough
-def test_tables_have_printed_and_recomputed_columns(page):
+def test_tables_have_printed_and_recomputed_columns(report):
     for key in TABLES:
-        table = page.articles[f"table-{key}"]
+        table = report.articles[f"table-{key}"]
         heads = " | ".join(table["heads"])
         assert "printed" in heads, key
         assert re.search(r"recomputed|mean %|mean \(5\.1\)|mean over the loads", heads), (key, heads)
@@ -107,45 +108,47 @@ def test_tables_have_printed_and_recomputed_columns(page):
 
 
 @pytest.mark.thorough
-def test_every_figure_is_drawn(page):
+def test_every_figure_is_drawn(report):
     for key in FIGURES:
-        assert page.articles[f"figure-{key}"]["shapes"] > 5, key
-    assert page.articles["figure-9"]["verdict"] == "given"
-    assert "A block diagram" in page.articles["figure-9"]["reason"]
+        assert report.articles[f"figure-{key}"]["shapes"] > 5, key
+    assert report.articles["figure-9"]["verdict"] == "given"
+    assert "A block diagram" in report.articles["figure-9"]["reason"]
 
 
 @pytest.mark.thorough
-def test_every_item_has_a_verdict_and_a_reason(page):
+def test_every_item_has_a_verdict_and_a_reason(report):
     fits = {f"fitted, {count} free parameters" for count in (2, 7, 8)}
     verdicts = {*fits, "recomputed", NO_DATA, CONTRADICTED, "given", "added"}
-    for key, article in page.articles.items():
+    for key, article in report.articles.items():
         assert article["verdict"] in verdicts, key
         assert len(article["reason"]) > 30, key
-    assert {article["verdict"] for article in page.articles.values()} == verdicts
+    assert {article["verdict"] for article in report.articles.values()} == verdicts
 
 
 @pytest.mark.thorough
-def test_items_from_unpublished_recordings_are_not_called_reproduced(page):
+def test_items_from_unpublished_recordings_are_not_called_reproduced(report):
     for key in ("8", "9", "11", "13"):
-        article = page.articles[f"table-{key}"]
+        article = report.articles[f"table-{key}"]
         assert article["verdict"] == NO_DATA
         assert "not published" in article["reason"]
 
 
 @pytest.mark.thorough
-def test_a_fit_gives_the_number_of_its_free_parameters(page):
+def test_a_fit_gives_the_number_of_its_free_parameters(report):
     fits = {
-        key: article["verdict"] for key, article in page.articles.items() if article["verdict"].startswith("fitted")
+        key: article["verdict"] for key, article in report.articles.items() if article["verdict"].startswith("fitted")
     }
     free = {"table-2": 2, "table-3": 2, "table-5": 8, "table-10": 7}
     assert fits == {key: f"fitted, {count} free parameters" for key, count in free.items()}
 
 
 @pytest.mark.thorough
-def test_items_without_data_are_not_contradicted(page):
-    contradicted = {key for key, article in page.articles.items() if article["verdict"] == CONTRADICTED}
+def test_items_without_data_are_not_contradicted(report):
+    contradicted = {key for key, article in report.articles.items() if article["verdict"] == CONTRADICTED}
     assert contradicted == {"table-4", "table-6", "table-7", "table-12", "figure-20"}
-    recordings = [article for article in page.articles.values() if "recordings are not published" in article["reason"]]
+    recordings = [
+        article for article in report.articles.values() if "recordings are not published" in article["reason"]
+    ]
     assert [article["verdict"] for article in recordings].count(NO_DATA) == 17
 
 
@@ -155,24 +158,24 @@ def test_report_states_that_only_the_text_was_available(report_text):
 
 
 @pytest.mark.thorough
-def test_numbers_of_verdicts_agree_with_the_documentation(page):
+def test_numbers_of_verdicts_agree_with_the_documentation(report):
     text = (Path(__file__).parents[3] / "docs" / "theory" / "thesis.md").read_text(encoding="utf-8")
-    verdicts = [item["verdict"].partition(",")[0] for item in page.articles.values() if item["verdict"] != "added"]
+    verdicts = [item["verdict"].partition(",")[0] for item in report.articles.values() if item["verdict"] != "added"]
     for verdict, count in Counter(verdicts).items():
         assert f"| {verdict} | {count} |" in text
 
 
 @pytest.mark.thorough
-def test_report_loads_no_other_files(report_text, page):
-    assert page.loaded_urls == [target for target in page.loaded_urls if target.startswith("#")]
+def test_report_loads_no_other_files(report_text, report):
+    assert report.loaded_urls == [target for target in report.loaded_urls if target.startswith("#")]
     assert not re.search(r"@import|url\(\s*[\"']?(?!#)", report_text)
     assert not re.search(r"(?:src|href)\s*=\s*[\"'](?:https?:)?//", report_text)
 
 
 @pytest.mark.thorough
-def test_closing_note_lists_every_item(report_text, page):
+def test_closing_note_lists_every_item(report_text, report):
     note = report_text.split('id="summary"', 1)[1]
-    for key in page.articles:
+    for key in report.articles:
         assert f'href="#{key}"' in note
 
 
@@ -207,7 +210,7 @@ def test_small_parameters_of_table_3_keep_the_errors_of_their_initial_values(rep
 
 
 @pytest.mark.thorough
-def test_static_beats_dynamic_in_table_12_with_the_printed_parameters_and_not_with_refitted_ones(report_text):
+def test_dynamic_error_of_table_12_is_smaller_than_the_static_one_only_with_refitted_parameters(report_text):
     dynamic, static = ([float(cell) for cell in row[2:]] for row in cells(report_text, "table-12"))
     assert (dynamic[0], static[0]) == pytest.approx((0.0826, 0.0812), abs=5e-5)
     assert dynamic[2] < 0.5 * static[2]  # with refitted a13 to a15
@@ -218,29 +221,29 @@ def test_option_table_selects_one_table(tmp_path, capsys):
     assert (code, err) == (0, "")
     assert "Table 5" in out
     assert "3666.67" in out  # the recomputed parameter a12
-    page = ReportParser((tmp_path / "index.html").read_text(encoding="utf-8"))
-    assert list(page.articles) == ["table-5"]
+    report = ReportParser((tmp_path / "index.html").read_text(encoding="utf-8"))
+    assert list(report.articles) == ["table-5"]
 
 
 def test_option_figure_selects_one_figure(tmp_path, capsys):
     code, out, _ = run(capsys, "thesis", "--figure", "19", "--out", tmp_path)
     assert code == 0
     assert "Figure 19" in out
-    page = ReportParser((tmp_path / "index.html").read_text(encoding="utf-8"))
-    assert list(page.articles) == ["figure-19"]
-    assert page.articles["figure-19"]["shapes"] > 5
+    report = ReportParser((tmp_path / "index.html").read_text(encoding="utf-8"))
+    assert list(report.articles) == ["figure-19"]
+    assert report.articles["figure-19"]["shapes"] > 5
 
 
 def test_user_errors_end_with_code_2(tmp_path, capsys, data):
-    steps, rests = data / "leaf" / "cc_1c.csv.gz", tmp_path / "rests.csv"
+    constant_load, relaxation_test = data / "leaf" / "cc_1c.csv.gz", tmp_path / "rests.csv"
     rows = relaxation()[["time_s", "current_a", "voltage_v"]]
-    np.savetxt(rests, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
+    np.savetxt(relaxation_test, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="", fmt="%.6f")
     for arguments, words in (
         (("--table", "14"), "no table 14: tables are 1 to 13"),
         (("--figure", "51"), "no figure 51"),
-        ((steps,), "captures require --cell"),
-        ((rests, "--cell", "ncr18650"), "the protocol needs a constant load"),
-        ((steps, "--cell", "leaf"), "the protocol needs a voltage relaxation test"),
+        ((constant_load,), "captures require --cell"),
+        ((relaxation_test, "--cell", "ncr18650"), "the protocol needs a constant load"),
+        ((constant_load, "--cell", "leaf"), "the protocol needs a voltage relaxation test"),
     ):
         code, out, err = run(capsys, "thesis", *arguments, "--out", tmp_path / "none")
         assert (code, out) == (2, "")

@@ -1,11 +1,11 @@
-"""Ends of charge of usual chargers: which of them are full, and whether the error is within the std of the anchor."""
+"""Full anchors (SOC 1) at the ends of simulated charges: found only at a full cell, with an error within their std."""
 
 import pytest
 
 from tests.estimator.anchors.chargers import anchors, cases
 
 MAX_STDS = 1.25
-"""Maximum error of an anchor in its std. The end of a charge is always too early, so that the error has one sign."""
+"""Maximum error of an anchor's SOC, as a multiple of its std. All chargers stop before SOC 1, so that the error has one sign."""
 CASES = {case.name: case for case in cases()}
 
 
@@ -35,7 +35,7 @@ def test_end_of_a_charge_is_full_within_its_std(name: str) -> None:
     assert 1.0 - found[0].true_soc < MAX_STDS * found[0].std
 
 
-def test_interrupted_charge_is_full_twice_if_charge_was_drawn() -> None:
+def test_charge_that_a_load_interrupts_has_two_full_anchors() -> None:
     case = CASES["lfp load of 0.5C switched on at C/8, for 10 min"]
     found = anchors(case, case.charged())
     assert len(found) == 2

@@ -30,7 +30,7 @@ def receive_states(states: dict[str, bytes], now_s: float = 0.0) -> FleetPacks:
     return packs
 
 
-def test_pack_without_a_state_or_with_none_for_three_minutes_is_silent():
+def test_pack_that_never_sent_a_state_or_none_within_three_minutes_is_silent():
     packs = receive_states({"a": healthy(), "b": healthy()})
     packs.set_type("c", "lfp 16s1p")
     packs.receive_state("b", healthy(), 100.0)
@@ -69,7 +69,7 @@ def test_soc_and_its_std_are_counted_in_bins_for_each_type():
     assert {i: n for i, n in enumerate(home["soc"]) if n} == {0: 1, 1: 1, 19: 1}
     assert home["soc_median"] == 0.05
     assert home["soc_std_median"] == 0.01
-    assert {i: n for i, n in enumerate(home["soc_std"]) if n} == {2: 3}
+    assert {i: n for i, n in enumerate(home["soc_std"]) if n} == {2: 3}  # 0.01 is the lower edge of bin 2
     assert unlisted["type"] == UNLISTED
     assert unlisted["soc_std"][-1] == 1
 
@@ -93,8 +93,8 @@ def test_packs_with_concerns_are_ranked_and_count_once_for_attention():
         }
     )
     faults = InputFault.CAPACITY | InputFault.SIGN_OF_CURRENT
-    packs.receive_hour("wide", json.dumps({"suspects": int(faults)}).encode())
-    packs.receive_hour("healthy", json.dumps({"suspects": int(InputFault.OCV)}).encode())
+    packs.receive_hour_summary("wide", json.dumps({"suspects": int(faults)}).encode())
+    packs.receive_hour_summary("healthy", json.dumps({"suspects": int(InputFault.OCV)}).encode())
     overview = packs.overview(1.0, 0.0)
     concerns = overview["concerns"]
     assert {kind: each["count"] for kind, each in concerns.items()} == {
@@ -103,6 +103,7 @@ def test_packs_with_concerns_are_ranked_and_count_once_for_attention():
         "suspects": 2,
         "silent": 0,
     }
+    # listed are the smallest margins, also those above the limit
     assert [name for name, _ in concerns["margin"]["packs"]] == ["low", "lower", "wide", "healthy"]
     assert concerns["soc"]["packs"][0] == ["lower", 0.02]
     assert concerns["suspects"]["packs"] == [["wide", "sign of current, capacity"], ["healthy", "ocv"]]
@@ -137,7 +138,7 @@ def test_packs_are_found_by_prefix():
 def test_details_of_a_pack_have_its_state_parameters_and_suspected_faults():
     packs = receive_states({"a": healthy()}, 5.0)
     packs.receive_parameters("a", CELL_SNAPSHOT.parameters.model_dump_json().encode())
-    packs.receive_hour("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
+    packs.receive_hour_summary("a", json.dumps({"suspects": int(InputFault.OFFSET)}).encode())
     details = packs.details("a", 7.0)
     assert details
     assert (details["pack"], details["type"], details["heard_s"]) == ("a", "lfp 16s1p", 2.0)
@@ -151,9 +152,9 @@ def test_details_of_a_pack_have_its_state_parameters_and_suspected_faults():
 def test_invalid_messages_are_counted_and_skipped(data: bytes) -> None:
     packs = FleetPacks()
     packs.receive_state("a", data, 0.0)
-    packs.receive_hour("a", data)
+    packs.receive_hour_summary("a", data)
     packs.receive_parameters("b", data)
-    assert packs.damaged == 1
+    assert packs.damaged == 1  # counts states only
     assert packs.overview(0.0, 0.0)["packs"]["known"] == 0
     assert packs.details("b", 0.0)["parameters"] is None
 
@@ -171,7 +172,7 @@ def heartbeat(worker: str, *partitions: int, **values: object) -> Heartbeat:
     return Heartbeat.model_validate({"id": worker, "started_s": 0.0, "partitions": partitions, **values})
 
 
-def test_partitions_without_a_worker_or_with_two_are_found_until_a_worker_is_dead():
+def test_partitions_with_no_or_two_live_workers_are_reported():
     workers = FleetWorkers(4)
     workers.receive(heartbeat("b", 2, 9, lag_s=3.0), 0.0)  # there is no partition 9
     workers.receive(heartbeat("a", 0, 2, lag_s=1.0), 1.0)
@@ -252,7 +253,7 @@ def test_invalid_heartbeats_are_counted_and_skipped():
     view = FleetView(1, 0.0)
     view.receive_worker(b"{}", 0.0)
     view.receive_worker(heartbeat("w", 0).model_dump_json().encode().replace(b"0.0", b"NaN"), 0.0)
-    view.overview_json(0.0, 0.0)
+    view.overview_json(0.0, 0.0)  # raises no error, because the NaN was rejected
     assert view.overview(0.0, 0.0)["damaged"] == 2
 
 
@@ -269,7 +270,7 @@ def test_new_connection_clears_workers_but_not_packs():
 
 def test_type_name_has_cell_layout_and_capacity():
     assert type_name(HOME) == "lfp 16s1p 280 Ah"
-    assert type_name("series: must be above 0") == "wrong rows"
+    assert type_name("series: must be above 0") == "wrong rows"  # a row with an error is replaced by its text
 
 
 def test_worker_of_a_version_without_formats_and_dead_letters_is_listed():

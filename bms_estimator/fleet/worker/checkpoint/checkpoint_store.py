@@ -113,7 +113,7 @@ class CheckpointStore:
         increments from the pointer.
 
         Raises:
-            FencedError: Another worker has claimed it at the same time.
+            FencedError: Another worker has claimed the partition at the same time.
             UnreadableFormatError: The last checkpoint has a format that this version cannot read. Nothing was changed.
         """
         stored = await self.claims.read(partition)

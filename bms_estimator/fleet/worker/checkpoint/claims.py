@@ -115,7 +115,7 @@ class Claims:
         """Check that the last checkpoint of a partition can be read.
 
         Raises:
-            UnreadableFormatError: It has a format that this version cannot read.
+            UnreadableFormatError: The checkpoint has a format that this version cannot read.
         """
         await self.read(partition)
 

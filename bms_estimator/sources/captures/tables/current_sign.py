@@ -18,8 +18,8 @@ SIGN_TEXTS: dict[CurrentSign, str] = {
 
 
 MAX_LOADS_WITHOUT_WORD = 0.05
-"""Maximum fraction of the rows with a load that have no word, for a direction by the states alone. A row at the change of a step
-may have the state of the previous step."""
+"""Maximum fraction of the rows with a load that have no word, if the states alone give the direction. A row at the change of a
+step may have the state of the previous step."""
 
 
 MIN_OPPOSITE_ROWS, MIN_OPPOSITE_FRACTION = 3, 0.02
@@ -77,7 +77,7 @@ class CurrentDirection(NamedTuple):
 
     sign: CurrentSign
     reason: str
-    by_state: bool = False
+    is_from_states: bool = False
     """True if words in a state column give the direction of the rows that have one."""
     row_factors: Floats | None = None
     """Factors of the rows, 1 on discharge and -1 on charge, of a current without a sign; None for a current with a sign."""
@@ -92,7 +92,7 @@ class CurrentDirection(NamedTuple):
     @property
     def text(self) -> str:
         """Direction and reason for messages."""
-        is_directed = self.by_state or self.row_factors is not None
+        is_directed = self.is_from_states or self.row_factors is not None
         return f"{'signed' if is_directed else SIGN_TEXTS[self.sign]} ({self.reason})"
 
 
@@ -121,10 +121,9 @@ def find_direction(
     if direction is None:
         direction = CurrentDirection("discharge_positive", "assumed: the file does not show it; --current-sign sets it")
     if words.in_all_loads or (words.has_words and not response.has_no_sign):
-        return CurrentDirection(direction.sign, f"column {layout.columns[Role.STATE].name}", by_state=True)
+        return CurrentDirection(direction.sign, f"column {layout.columns[Role.STATE].name}", is_from_states=True)
     if response.has_no_sign:
-        by_voltage = _direct_by_voltage(name, layout, direction, response)
-        return by_voltage._replace(by_state=words.has_words)
+        return _direction_of_unsigned(name, layout, direction, response)._replace(is_from_states=words.has_words)
     if response.sign is None or response.sign == direction.sign:
         return direction
     warning = (
@@ -143,7 +142,7 @@ def _column_direction(layout: Layout, words: StateWords) -> CurrentDirection | N
     return None
 
 
-def _direct_by_voltage(
+def _direction_of_unsigned(
     name: object, layout: Layout, direction: CurrentDirection, response: VoltageResponse
 ) -> CurrentDirection:
     """Return the direction of a current without a sign. A table with this project's columns keeps its direction, with a warning.

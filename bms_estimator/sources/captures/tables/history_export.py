@@ -117,13 +117,14 @@ def _repeat_times(voltage: TimedValues, current: TimedValues, changes_s: Floats,
         return changes_s
     before_s, after_s = changes_s[:-1], changes_s[1:]
     before_a = current.at(before_s)
-    holds = np.isfinite(before_a) & np.isfinite(voltage.at(before_s)) & (after_s - before_s <= MAX_SILENT_S)
-    ends = (current.at(after_s) != before_a) | ~np.isfinite(voltage.at(after_s))
+    is_repeated = np.isfinite(before_a) & np.isfinite(voltage.at(before_s)) & (after_s - before_s <= MAX_SILENT_S)
+    has_changed = (current.at(after_s) != before_a) | ~np.isfinite(voltage.at(after_s))
     last_s = after_s - period_s
     interval_s = max(REPEAT_PERIODS * period_s, MIN_REPEAT_S)
-    counts = np.where(holds, np.ceil((last_s - before_s) / interval_s).clip(min=1.0) - 1.0, 0.0).astype(np.int64)
+    counts = np.where(is_repeated, np.ceil((last_s - before_s) / interval_s).clip(min=1.0) - 1.0, 0.0).astype(np.int64)
+    # number of each repetition after its change, from 1
     number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 1
-    has_last = holds & ends & (last_s - before_s > 0.5 * period_s)
+    has_last = is_repeated & has_changed & (last_s - before_s > 0.5 * period_s)
     return np.concatenate([np.repeat(before_s, counts) + number * interval_s, last_s[has_last]])
 
 

@@ -146,7 +146,7 @@ class Table:
                 factors = self._direction.row_factors[rows : rows + samples.size]
                 samples["current_a"] = factors * np.abs(samples["current_a"])
                 rows += samples.size
-            if self._direction.by_state:
+            if self._direction.is_from_states:
                 state = raw[Role.STATE]
                 directed = state * np.abs(samples["current_a"])
                 samples["current_a"] = np.where(np.abs(state) == 1.0, directed, samples["current_a"])

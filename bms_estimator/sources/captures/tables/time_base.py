@@ -13,15 +13,16 @@ from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit, find_u
 FIRST_UNIX_S, LAST_UNIX_S = 9e8, 4e9
 """Range of Unix times in a capture: 1998 to 2096 [s]."""
 MIN_BETTER_FRACTION = 0.1
-"""Minimum advantage of the second time column for its choice, in the fraction of times that are not later than all before."""
+"""Minimum difference at which the second time column is chosen: fraction of disordered times of the first one (times that are not
+later than all before them), minus that of the second one."""
 MAX_RATE_ERROR = 0.2
 """Maximum relative difference of the rates of two time columns that agree."""
 DAY_S = 86_400.0
 CHUNKS = 8
 """Number of parts of a table in which two time columns are compared. Their median excludes pauses of one of them."""
 ROLLOVERS_S = {CellKind.DURATION: (DAY_S, 1800.0)} | dict.fromkeys(DATES, (3600.0, 600.0))
-"""Backward step of times of the day at midnight, and of dates at the end of summer time, by the kind of the cells; and the
-maximum true time between the rows around it [s]. If it is longer, the clock was set or the test was restarted."""
+"""Size of the expected backward step, and maximum true time between the two rows around it [s]. Times of the day step back at
+midnight, and dates at the end of summer time. With a longer true time, the clock was set or the test was restarted."""
 MIN_STEP_RESTARTS, MIN_STEP_FRACTION, MIN_STEP_CHANGE = 2, 0.8, 0.05
 """For a time that starts again with each step: minimum number of its restarts, minimum fraction of them at which the current
 changes, and minimum change relative to the range of the current."""
@@ -66,9 +67,9 @@ def find_time_base(layout: Layout, raw: RawBlock) -> TimeBase:
     time, clock = layout.columns[Role.TIME], layout.columns.get(Role.CLOCK)
     if clock is not None and time.kind is CellKind.DURATION and _is_time_of_day(clock, raw):
         return TimeBase(layout, reason=f'after "{clock.name}"')
-    time_base = _by_unix_time(layout, time, raw[Role.TIME]) or _by_excel_days(layout, time, raw[Role.TIME])
+    time_base = _unix_time_base(layout, time, raw[Role.TIME]) or _spreadsheet_time_base(layout, time, raw[Role.TIME])
     if time_base is None and clock is not None and not clock.assumed:
-        time_base = _by_clock(layout, time, clock, raw)
+        time_base = _clock_time_base(layout, time, clock, raw)
     if time_base is not None:
         return time_base
     warning = _implausible_period(time, raw[Role.TIME]) if time.assumed else ""
@@ -132,7 +133,7 @@ def is_descending(values: Floats) -> bool:
     return bool(steps.size > 1 and np.mean(steps < 0.0) >= MIN_DESCENDING_FRACTION)
 
 
-def _by_unix_time(layout: Layout, time: Column, values: Floats) -> TimeBase | None:
+def _unix_time_base(layout: Layout, time: Column, values: Floats) -> TimeBase | None:
     """Return the time base of Unix times in another unit than seconds; None for other times."""
     unit = unix_unit(values)
     if unit is None or time.kind is not CellKind.NUMBER or unit == time.unit:
@@ -146,7 +147,7 @@ def _by_unix_time(layout: Layout, time: Column, values: Floats) -> TimeBase | No
     return TimeBase(without_clock(layout), warning=warning)
 
 
-def _by_excel_days(layout: Layout, time: Column, values: Floats) -> TimeBase | None:
+def _spreadsheet_time_base(layout: Layout, time: Column, values: Floats) -> TimeBase | None:
     """Return the time base of dates that a spreadsheet has written as numbers of days; None for other times."""
     if time.kind is not CellKind.NUMBER or not time.assumed:
         return None
@@ -160,7 +161,7 @@ def _by_excel_days(layout: Layout, time: Column, values: Floats) -> TimeBase | N
     return TimeBase(_with_unit(layout, time, day), reason="days of a spreadsheet") if day else None
 
 
-def _by_clock(layout: Layout, time: Column, clock: Column, raw: RawBlock) -> TimeBase | None:
+def _clock_time_base(layout: Layout, time: Column, clock: Column, raw: RawBlock) -> TimeBase | None:
     """Return the time base that a second time column shows; None if it shows nothing."""
     rate = _rate(raw[Role.CLOCK] * clock.unit.factor, raw[Role.TIME])
     if rate is None:

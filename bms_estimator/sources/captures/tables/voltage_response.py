@@ -23,16 +23,16 @@ MIN_STEPS_OF_LOAD = 5
 AGREEING_FRACTION = 0.8
 """Fraction of the steps, or of the charge, for which the voltage must respond in the same direction."""
 MIN_STRETCH_FRACTION = 0.5
-"""Minimum fraction of the charge in stretches of constant current, for a decision by the voltage in them."""
+"""Minimum fraction of the charge in stretches of constant current, for a decision from the voltage in them."""
 MIN_CORRELATION = 0.7
 """Minimum correlation of voltage and charge for a decision, if there are too few steps."""
 MIN_TREND_ROWS = 20
-"""Minimum number of samples for a decision by a trend of the voltage."""
+"""Minimum number of samples for a decision from a trend of the voltage."""
 NOISE_RATIO = 4.0
 """Minimum change of the voltage in a trend, in std of its noise. Stretches end at extremes of the voltage, which include noise."""
 MIN_OTHER_FRACTION = 0.1
-"""Minimum fraction of the charge that, by the voltage, flows in the other direction. It shows that a current of one sign lacks its
-sign, and that charge and discharge follow each other without a rest in a load."""
+"""Minimum fraction of the charge that, according to the voltage, flows in the other direction. This fraction shows that the file
+lacks the sign of the current, and that a load consists of charge and discharge without a rest between them."""
 MIN_REVERSAL = 0.03
 """Minimum change of the voltage against the direction of a load, in a stretch of constant current, relative to the voltage.
 Recovery after a larger current, and warming of a cold cell, change it less."""
@@ -135,10 +135,10 @@ def _constant_stretches(rows: SampleBlock) -> _Parts:
 def _without_sign(rows: SampleBlock, stretches: _Parts) -> VoltageResponse | None:
     """Return the directions of the loads of a current with one sign; None if all have the same direction."""
     loads = _parts(rows, np.zeros(rows.size, dtype=np.bool_), _is_load(rows))
-    direction = _direction_by_steps(rows, loads)
-    by_ends, has_reversal = _direction_by_ends(rows, loads, stretches)
+    direction = _directions_from_steps(rows, loads)
+    direction_from_ends, has_reversal = _directions_from_ends(rows, loads, stretches)
     has_reversal &= direction == 0.0
-    direction = np.where(direction == 0.0, by_ends, direction)
+    direction = np.where(direction == 0.0, direction_from_ends, direction)
     total = loads.charge.sum()
     discharge, charge, reversing = (
         loads.charge[mask].sum() for mask in (direction > 0.0, direction < 0.0, has_reversal)
@@ -153,7 +153,7 @@ def _without_sign(rows: SampleBlock, stretches: _Parts) -> VoltageResponse | Non
     return VoltageResponse(row_factors=factors, has_no_sign=True)
 
 
-def _direction_by_steps(rows: SampleBlock, loads: _Parts) -> Floats:
+def _directions_from_steps(rows: SampleBlock, loads: _Parts) -> Floats:
     """Return 1 for loads in whose steps the voltage falls with the magnitude of the current, -1 if it rises, 0 for few steps."""
     index, rising = _steps(np.abs(rows["current_a"]), rows["voltage_v"])
     load = np.searchsorted(loads.first, index + 1, side="right") - 1  # a step from a rest belongs to the load after it
@@ -164,8 +164,8 @@ def _direction_by_steps(rows: SampleBlock, loads: _Parts) -> Floats:
     return np.where(is_clear, np.where(fraction > 0.5, -1.0, 1.0), 0.0)
 
 
-def _direction_by_ends(rows: SampleBlock, loads: _Parts, stretches: _Parts) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the directions of loads by their last voltage, compared with the rests around them and with their first voltage.
+def _directions_from_ends(rows: SampleBlock, loads: _Parts, stretches: _Parts) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the directions of loads, from their last voltage compared with the rests around them and with their first voltage.
 
     Returns:
         1 on discharge, -1 on charge, 0 if it is not clear; and whether a load consists of charge and discharge without a rest.
@@ -199,7 +199,7 @@ def _trend_response(rows: SampleBlock, stretches: _Parts) -> int:
 
 
 def _noise(voltage_v: Floats) -> float:
-    """Return the std of white noise in the voltage, by the products of successive changes; 0 if most have the same direction."""
+    """Return the std of white noise in the voltage, from the products of successive changes; 0 if most have the same direction."""
     changes_v = np.diff(voltage_v)
     return float(np.sqrt(max(-np.mean(changes_v[1:] * changes_v[:-1]), 0.0)))
 
