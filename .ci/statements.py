@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LIMITS = {"bms_estimator": 46_515, "tests": 49_397}
+LIMITS = {"bms_estimator": 46_525, "tests": 49_407}
 
 
 def is_text(node: ast.stmt) -> bool:
