@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.doctor import device_check
-from bms_estimator.doctor.device_check import check_board, check_device, first_sample_s
+from bms_estimator.doctor.device_check import check_board, check_device, first_sample_timeout_s
 from bms_estimator.doctor.finding import Level
 from bms_estimator.process.instance_lock import instance_lock
 from bms_estimator.simulation.simulated_bms import SimulatedBms
@@ -30,7 +30,7 @@ BOARD = {"serial": "0000002a", "divider": "6.1", "volts_per_ampere": "0.1", "ban
 @pytest.fixture
 def board_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Run a board with 13.2 V and 0.5 A, and return its port."""
-    monkeypatch.setattr(device_check, "FIRST_SAMPLE_TIMEOUT_S", LONG_S)
+    monkeypatch.setattr(device_check, "MIN_FIRST_SAMPLE_TIMEOUT_S", LONG_S)
     with VirtualBoard(lambda _: Reading(current_a=0.5, voltage_v=13.2, temperature_c=25.0), serial=42) as board:
         loop = asyncio.new_event_loop()
         task = loop.create_task(board.run())
@@ -52,7 +52,7 @@ def test_a_board_that_answers_is_reported_with_its_values(tmp_path: Path, board_
 
 
 def test_a_silent_device_is_a_fault(tmp_path: Path, line: Line, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_check, "FIRST_SAMPLE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(device_check, "MIN_FIRST_SAMPLE_TIMEOUT_S", 0.2)
     line.plug()
     (device,) = check_device(subject(tmp_path, sensor={"port": str(line.path)}))
     assert device.level is Level.FAULT
@@ -67,11 +67,11 @@ def test_a_source_has_time_for_two_samples_and_for_its_longest_silence(
     tmp_path: Path, source: dict[str, float], wait_s: float
 ) -> None:
     mqtt = {"kind": "mqtt", "topic": "bms", "voltage": "v", "current": "i", "interval_s": 1.0} | source
-    assert first_sample_s(subject(tmp_path, source=mqtt).settings) == wait_s
+    assert first_sample_timeout_s(subject(tmp_path, source=mqtt).settings) == wait_s
 
 
 def test_another_number_of_cells_than_in_series_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_check, "FIRST_SAMPLE_TIMEOUT_S", LONG_S)
+    monkeypatch.setattr(device_check, "MIN_FIRST_SAMPLE_TIMEOUT_S", LONG_S)
     monkeypatch.setattr(device_check, "CELLS_TIMEOUT_S", 0.1)
     bms = SimulatedBms("jk", lambda _: Reading(current_a=5.0, voltage_v=16.5, temperature_c=25.0), cells=5)
     with running_device(bms) as port:

@@ -57,7 +57,7 @@ def test_firmware_and_virtual_board_have_the_divider_and_slope_of_the_drawing() 
 
 def test_documented_voltage_steps_are_those_of_the_board_and_of_the_default_setting() -> None:
     assert f"{5.0 * (R1 + R2) / R2 / FULL_SCALE * 1e3:.1f} mV" in TABLE
-    assert f"{SensorSettings().voltage_resolution_v * 1e3:.1f} mV unless set" in TABLE
+    assert f"Its default, {SensorSettings().voltage_resolution_v:.4f}," in TABLE
 
 
 @pytest.mark.parametrize(

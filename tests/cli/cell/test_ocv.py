@@ -227,7 +227,7 @@ def test_kinds_of_captures_are_recognized_and_combined_to_one_curve(tmp_path, ca
         "C/10 discharge, 4.945 Ah",
         "given curve, 101 points",
         "recognized as",
-        "Elements: those of the generic nca",
+        "Circuit elements: those of the generic nca",
     ):
         assert words in text + out.read_text()
 
@@ -247,7 +247,7 @@ def test_unpaired_slow_curve_of_lfp_is_centered_on_the_hysteresis(tmp_path, caps
     assert unpaired.hysteresis_v == pytest.approx(np.full(len(unpaired.soc), 0.01))
     assert "Hysteresis: that of the generic lfp" in out.read_text()
     assert "Hysteresis" not in pair.read_text()
-    assert "Elements: those of the generic lfp" in out.read_text()
+    assert "Circuit elements: those of the generic lfp" in out.read_text()
 
 
 def test_unpaired_slow_curve_of_a_layered_oxide_is_corrected(tmp_path, capsys, data):

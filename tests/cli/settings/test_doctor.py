@@ -46,7 +46,7 @@ def _empty_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def pack(tmp_path: Path, broker: Broker, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a settings file whose source is silent."""
-    monkeypatch.setattr("bms_estimator.doctor.device_check.FIRST_SAMPLE_TIMEOUT_S", 1.0)
+    monkeypatch.setattr("bms_estimator.doctor.device_check.MIN_FIRST_SAMPLE_TIMEOUT_S", 1.0)
     file = tmp_path / "pack.toml"
     file.write_text(PACK.format(url=broker.url, folder=tmp_path / "state"))
     return file
@@ -103,6 +103,6 @@ def test_settings_that_only_root_can_read_need_sudo(tmp_path: Path, monkeypatch:
 def test_a_long_wait_for_a_sample_is_announced(
     capsys: pytest.CaptureFixture[str], pack: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bms_estimator.cli.settings.doctor.FIRST_SAMPLE_S", 0.5)
+    monkeypatch.setattr("bms_estimator.cli.settings.doctor.MIN_FIRST_SAMPLE_TIMEOUT_S", 0.5)
     code, _, err = run(capsys, "doctor", pack)
     assert (code, err) == (1, "waiting up to 1 s for a sample of the device\n")
