@@ -129,7 +129,7 @@ def seed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pack = Pack(tmp_path_factory.mktemp("seed"))
     pack.run(2.0)
     history = pack.slow_fit.history
-    history.first = ReferenceDischarges(history.rows[history.rows["direction"] > 0.0], pack.slow_fit.fit)
+    history.first_discharges = ReferenceDischarges(history.rows[history.rows["direction"] > 0.0], pack.slow_fit.fit)
     history.weak_cell_times = [WeakCellTime(100.0, 200.0, 0.5), WeakCellTime(1000.0, np.inf, 0.4)]
     pack.save()
     assert pack.slow_fit.fits

@@ -47,7 +47,7 @@ def test_a_logged_exception_has_no_local_variables(
     lines: list[str], monkeypatch: pytest.MonkeyPatch, is_readable: bool
 ) -> None:
     if not is_readable:
-        monkeypatch.setattr(log_setup, "stderr", SimpleNamespace(take=lines.append))
+        monkeypatch.setattr(log_setup, "stderr", SimpleNamespace(put=lines.append))
         configure_logs()
     password = "not-for-the-log".upper()
     try:
@@ -73,7 +73,7 @@ def test_lines_beyond_the_queue_are_counted_as_lost_and_queued_lines_keep_their_
     monkeypatch.setattr(stderr_writer, "MAX_QUEUED_LINES", 4)
     out = Stderr()
     for i in range(20):
-        out.take(f"line {i}")
+        out.put(f"line {i}")
     out.drain()  # returns after its timeout
     lost = out.lost
     assert 15 <= lost <= 16  # of 20 lines, 4 wait in the queue; the writer may have removed one more from it
