@@ -1,7 +1,7 @@
 """Present capability of a pack: available power, usable capacity, remaining energy, and time to full.
 
 These values need no forecast of the load, and therefore exist at rest and during a charge, too. In a pack with cell voltages,
-single cells limit them. The limit of a cell's voltage is that of the pack divided by the number of cells in series. A pack whose
+single cells limit them. A cell's voltage limit is the pack's limit divided by the number of cells in series. A pack whose
 cells all equal one cell reaches its limit when this cell does.
 """
 

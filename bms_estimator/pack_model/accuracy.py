@@ -116,9 +116,8 @@ class Accuracy:
         covariance[SOC, SOC] = NEW_SEGMENT_STD**2
         covariance[LN_Q, LN_Q] = capacity_std**2 + relative_offset**2
         covariance[HYSTERESIS, HYSTERESIS] = 2.0 * HYSTERESIS_STD**2  # fast and slow part are both saturated
-        curve_v2 = curve_covariance(self.cell, self.soc) + 1e-10 * np.eye(
-            self.soc.size
-        )  # positive definite despite rounding
+        # the second term keeps the sum positive definite despite rounding
+        curve_v2 = curve_covariance(self.cell, self.soc) + 1e-10 * np.eye(self.soc.size)
         if not self.window.has_temperature:
             temperature_std_v = UNMEASURED_K * np.hypot(
                 np.interp(self.soc, SOC_GRID, self.cell.per_kelvin_v), ENTROPY_STD_V

@@ -42,7 +42,7 @@ from empty gave an SOC 6 to 8 % wrong, because errors of offset, capacity and kn
 24 h of six real histories had an RMS error of 1.6 % with 0.008, 2.3 % with 0.015, and 1.9 % with 0.005."""
 SURFACE_STD_SOC, SURFACE_WIDTH_SOC = 0.03, 0.25
 """Std of the difference between the SOC at the surface of the particles and the model's, per C-rate of discharge at 25 C, and
-SOC over which it decays [SOC]. The C-rate is that of the current filtered by ``TREND_PAIR``. The voltage collapses when the surface is empty: at 0 C
+SOC over which it decays [SOC]. The C-rate is computed from the current filtered by ``TREND_PAIR``. The voltage collapses when the surface is empty: at 0 C
 and 1C, a cell of 58 Ah ends its discharge with 20 % of its charge left. Without this std, the fit takes the collapse for the knee of
 the OCV. Diffusion depends on the temperature as the strong part of the resistances does."""
 START_LOAD_C = 0.6

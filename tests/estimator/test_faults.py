@@ -148,7 +148,7 @@ def test_the_soc_recovers_after_an_hour_of_bad_input(captures: Path, name: str, 
     run = run_with_fault_of_an_hour(fault, capture(captures, name))
     assert np.isfinite(run.error).all()
     assert np.abs(run.error[run.after(FAULT_S[1] + 3600.0)]).max() < 0.025
-    # 0.876 on cell1_dst: hypotheses keep their weights longer since repeated updates have the likeliest variance; 0.93 before
+    # 0.876 on cell1_dst, where the reversal is found only after 40 min
     assert run.coverage() > (0.87 if fault is reverse_current else 0.95)
 
 
@@ -169,8 +169,7 @@ def test_a_temporary_fault_is_reported_and_then_cleared(
     reported = run.suspects & suspect != 0
     assert reported[(run.time_s > FAULT_S[0]) & (run.time_s < FAULT_S[1])].any()
     assert not reported[run.time_s < FAULT_S[0]].any()
-    # until the zeros are found frozen, after 12 min, the filter learns an offset from them; hours later it may doubt the capacity
-    assert run.suspects[-1] & ~(InputFault.CAPACITY if fault is set_current_to_zero else 0) == 0
+    assert run.suspects[-1] == 0
 
 
 @pytest.mark.parametrize("name", CHANGING_LOADS)

@@ -65,7 +65,7 @@ class OcvResult:
     generic: str
     """Most similar generic cell. Its resistances are scaled to the resistances of the captures."""
     usual_hysteresis: bool
-    """True if the hysteresis is the typical one, that of the generic cell, because no source determines it."""
+    """True if no source determines the hysteresis, so that the generic cell's is used."""
     series_count: int
     points: int
     soc: list[float]

@@ -38,7 +38,7 @@ default."""
 DEAD_AGE_S = 30 * 86_400.0
 """Maximum age of a message in the stream ``DEAD`` [s]."""
 MAX_BLOCK_BYTES = 256 << 10
-"""Maximum size of a block in ``RAW`` [bytes], that of 7,000 incompressible samples."""
+"""Maximum size of a block in ``RAW`` [bytes]: 7,000 incompressible samples."""
 MAX_BATCH_BYTES = (1 << 20) - (16 << 10)
 """Maximum size of a batch in ``TELEMETRY`` [bytes]: the server's limit of a message, 1 MiB, less 16 KiB for the reason with which
 ``DEAD`` stores a rejected batch."""

@@ -136,7 +136,7 @@ def cell_of(spec: PackSpec, cell_file: str | None) -> PackModel:
         return load_model(name, spec.capacity_ah)
     if cell_file is None:
         raise UserError(
-            f"{name}: no cell file of this name was uploaded, and it is none of the shipped cells {', '.join(shipped_cell_names())}"
+            f"{name}: no cell file of this name was uploaded, and no shipped cell has this name ({', '.join(shipped_cell_names())})"
         )
     if not _is_fuel_cell(cell_file):
         cell = parse_toml(cell_file, CellModel, f"cell {name}")

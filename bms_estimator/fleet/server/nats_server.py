@@ -61,7 +61,7 @@ gradually, so that they move to other nodes, and then ends."""
 HEALTH_S = 10.0
 """Poll interval for the health of the streams [s]."""
 MIN_FREE_FRACTION = 0.05
-"""Minimum free fraction of a disk that was full, for the restart of the server. It is that of the alert ``FleetDiskFull``."""
+"""Minimum free fraction of a disk that was full, for the restart of the server. The alert ``FleetDiskFull`` has the same limit."""
 CONFIGURATION = "nats-server.conf"
 """Name of the server's configuration file."""
 

@@ -176,7 +176,7 @@ class BlockOrder(Enum):
     AHEAD = "gaps"
     """An earlier block is missing."""
     FORMER_STORE = "former_store"
-    """From an earlier store than that of the awaited block."""
+    """From a store that is older than the store of the awaited block."""
 
 
 def classify_block(delivery: np.void, block: BlockHeader) -> BlockOrder:

@@ -2,7 +2,7 @@
 
 At constant voltage the current decays about exponentially. Once it does, its measured time constant gives the time. Before that,
 the charge is simulated with the filter's model. In a cell whose OCV has a plateau, the surface of the particles is fuller than
-their mean during a charge, because the charge has to diffuse from the surface. The voltage is that of the surface.
+their mean during a charge, because the charge has to diffuse from the surface. The SOC at the surface determines the voltage.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Currents are positive on discharge, so that the charge current is below 0.
 """

@@ -50,7 +50,7 @@ FAST_RESISTANCES = 2
 """Number of fast resistances: R_0 and R_1. They decide the voltage at the peaks of a load, at which discharges end."""
 SURFACE_S = 15.0
 """Charge by which the surface of the particles is emptier than their mean, per ampere of the peak current [A s / A], at 25 C.
-Diffusion in the particles needs this gradient. The voltage is that of the surface, so that the knee near empty comes earlier
+Diffusion in the particles needs this gradient. The SOC at the surface determines the voltage, so that the knee near empty comes earlier
 under large currents. The gradient increases with the Arrhenius factor of ``LOW_ACTIVATION_ENERGY`` in the cold."""
 
 PROJECTED_PACK = np.dtype(

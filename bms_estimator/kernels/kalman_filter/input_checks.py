@@ -292,8 +292,8 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     """Process a sample without its voltage, during a fault of ``UNUSABLE``.
 
     A wrong sign of the current causes an SOC error of twice the charge, always in one direction. A frozen current may be
-    any typical load. When the fault ends, the SOC is re-initialized. Capacity and OCV are also re-initialized after a wrong
-    sign, unless their learning had ended before.
+    any typical load. When the fault ends, the SOC is re-initialized. After a wrong current, so are offset, capacity and OCV, which the
+    filter learned from it until the fault was found, unless their learning had ended before.
     """
     counted_soc = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
     error_soc = UNOBSERVED_CHARGE_ERROR * counted_soc
@@ -309,11 +309,9 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     if bits:
         c.suspects = bits
         return
-    soc_std = max(f.soc_std, RESTORED_STD)
-    if c.suspects & SIGN_OF_CURRENT:
-        soc_std = max(f.soc_std, p.soc_std)
-        if f.learned_soc < p.learning_soc:
-            initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
+    soc_std = max(f.soc_std, p.soc_std if c.suspects & SIGN_OF_CURRENT else RESTORED_STD)
+    if c.suspects & (SIGN_OF_CURRENT | CURRENT) and f.learned_soc < p.learning_soc:
+        initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
     spawn_hypotheses(f, p, f.soc, soc_std)
     reset_window(f)
     c.suspects = 0
