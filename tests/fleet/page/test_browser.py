@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import json
 import math
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -334,13 +334,25 @@ async def test_unreachable_server_is_reported_and_retried() -> None:
         assert await changes.get() == f"{url}: connection refused: no server listens on this address"
 
 
+def replace_refresh(
+    monkeypatch: pytest.MonkeyPatch, feed: FleetFeed, refresh: Callable[[], Awaitable[set[str]]]
+) -> None:
+    """Replace the poll of the table in one feed. The page of the module has another feed in this process."""
+    original = PackBucket.refresh
+
+    async def refresh_of_feed(bucket: PackBucket) -> set[str]:
+        return await (refresh() if bucket._nc is feed._nc else original(bucket))
+
+    monkeypatch.setattr(PackBucket, "refresh", refresh_of_feed)
+
+
 @in_module
 async def test_feed_ends_although_the_library_swallows_a_cancellation(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     refreshing, swallowed = asyncio.Event(), asyncio.Event()
 
-    async def refresh(_: PackBucket) -> set[str]:
+    async def refresh() -> set[str]:
         refreshing.set()
         try:
             await asyncio.Event().wait()
@@ -348,11 +360,9 @@ async def test_feed_ends_although_the_library_swallows_a_cancellation(
             swallowed.set()
         return set()
 
-    monkeypatch.setattr(PackBucket, "refresh", refresh)
-    async with (
-        asyncio.timeout(LONG_S),
-        FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), lambda _: None),
-    ):
+    feed = FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), lambda _: None)
+    replace_refresh(monkeypatch, feed, refresh)
+    async with asyncio.timeout(LONG_S), feed:
         await refreshing.wait()
     assert swallowed.is_set()
 
@@ -368,7 +378,7 @@ async def test_closed_connection_and_internal_error_of_the_feed_are_reported(
             while expected not in (await changes.get() or ""):
                 pass
 
-    async def refresh(_: PackBucket) -> set[str]:
+    async def refresh() -> set[str]:
         raise KeyError
 
     async with FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), changes.put_nowait) as feed:
@@ -377,8 +387,9 @@ async def test_closed_connection_and_internal_error_of_the_feed_are_reported(
         assert feed._nc
         await feed._nc.close()  # as if the server had closed the connection permanently
         await until("the server has closed the connection: check --creds")
-    monkeypatch.setattr(PackBucket, "refresh", refresh)
-    async with FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), changes.put_nowait):
+    feed = FleetFeed(Server(fleet.cluster.url), FleetView(PARTITIONS, 0.0), changes.put_nowait)
+    replace_refresh(monkeypatch, feed, refresh)
+    async with feed:
         await until("internal error of the page")
 
 
