@@ -291,16 +291,15 @@ def sign_is_wrong(c: Record, p: Record) -> bool:
 def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
     """Process a sample without its voltage, during a fault of ``UNUSABLE``.
 
-    A wrong sign of the current causes an SOC error of twice the charge, always in one direction. A frozen current may be
-    any typical load. When the fault ends, the SOC is re-initialized. After a wrong current, so are offset, capacity and OCV, which the
-    filter learned from it until the fault was found, unless their learning had ended before.
+    Before a wrong sign of the current is found, it leads the filter to any SOC. A frozen current may be any typical load.
+    When the fault ends, the SOC is re-initialized. After a wrong current, so are offset, capacity and OCV, which the filter
+    learned from it until the fault was found, unless their learning had ended before.
     """
-    counted_soc = abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
-    error_soc = UNOBSERVED_CHARGE_ERROR * counted_soc
+    error_soc = UNOBSERVED_CHARGE_ERROR * abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
     if c.suspects & CURRENT:
         error_soc = p.load_mean_c * min(dt_s, p.unmeasured_s) / 3600.0
     elif c.suspects & SIGN_OF_CURRENT:
-        error_soc = 2.0 * counted_soc
+        error_soc = MAX_SOC_STD
     soc_std = math.sqrt((f.soc_std + error_soc) ** 2 + (f.window.unknown_as / p.capacity_as) ** 2)
     f.soc_std = min(soc_std, MAX_SOC_STD)
     f.window.unknown_as = 0.0
@@ -309,7 +308,7 @@ def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_
     if bits:
         c.suspects = bits
         return
-    soc_std = max(f.soc_std, p.soc_std if c.suspects & SIGN_OF_CURRENT else RESTORED_STD)
+    soc_std = max(f.soc_std, RESTORED_STD)
     if c.suspects & (SIGN_OF_CURRENT | CURRENT) and f.learned_soc < p.learning_soc:
         initialize_filter(f, p, f.soc, f.current_a, f.temperature_c if f.sensed else math.nan)
     spawn_hypotheses(f, p, f.soc, soc_std)
