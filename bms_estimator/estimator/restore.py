@@ -12,7 +12,7 @@ from bms_estimator.estimator.history_rows import MAX_SEGMENT, checked_rows
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, MAX_ROWS
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENTS
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
-from bms_estimator.kernels.kalman_filter.mixture import decorrelate_state
+from bms_estimator.kernels.kalman_filter.mixture import scale_state
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET
 from bms_estimator.model.arrays import fields
@@ -92,7 +92,7 @@ def _reset_switched_states(estimator: Estimator) -> None:
     best = f["best"]
     for j, variance in ((OFFSET, offset_variance(p)), (LN_Q, p["capacity_std"] ** 2)):
         if (f["covariance"][best, j, j] > 0.0) != (variance > 0.0):
-            decorrelate_state(f["mean"][best], f["covariance"][best], j)
+            scale_state(f["mean"][best], f["covariance"][best], j, 0.0)
             f["covariance"][best, j, j] = variance
 
 

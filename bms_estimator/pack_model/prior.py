@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.kernels.kalman_filter.ekf import INDEPENDENT_R_STD
-from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
+from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD, SHAPE_CORRELATION_SOC, SHAPE_STD
 from bms_estimator.kernels.kalman_filter.ocv_correction import CORRELATION_SOC
 from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES, SHAPE_NODES
 from bms_estimator.model.arrays import Floats
@@ -34,8 +34,6 @@ ROUNDING_V2 = 1e-10
 """Variance added to each node of the OCV's error, so that rounding leaves its covariance positive definite [V^2]."""
 DIRECTION_CORRELATION_SOC = 0.1
 """Correlation length of the direction-dependent error [SOC]."""
-SHAPE_STD, SHAPE_CORRELATION_SOC = 0.15, 0.4
-"""Std and correlation length [SOC] of the relative error of the file's resistances over SOC."""
 EMPTY_SHAPE_STD = 0.5
 """Std of this relative error at SOC 0. Resistances near empty depend on the cell and on the load: at SOC 0 they are 1.4 to 3.4
 times those at SOC 0.5 in the cell files of Leaf, NCR18650, A123 and PF."""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.kalman_filter.hypotheses import spawn_hypotheses
-from bms_estimator.kernels.kalman_filter.records import LN_Q, NODE, Noise
+from bms_estimator.kernels.kalman_filter.hypotheses import spawn_after_gap, spawn_hypotheses
+from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, NODE, Noise
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.input_faults import InputFault
@@ -75,8 +75,7 @@ def test_a_short_gap_early_in_the_search_keeps_what_is_known() -> None:
 def test_a_loss_of_samples_while_parked_does_not_change_the_soc(kind: str, gap_s: float) -> None:
     """On a plateau the voltage cannot exclude another SOC, so that the SOC before the gap remains likely."""
     case = replace(CASES[kind], soc=0.75, hours=2.0)
-    current_a = np.r_[drive(case, 0.75, hours=0.5).samples["current_a"], np.zeros(5400)]
-    parked = capture(case, current_a)
+    parked = capture(case, np.r_[drive(case, 0.75, hours=0.5).samples["current_a"], np.zeros(5400)])
     estimator = Estimator(parked.cell, initial_soc=0.75)
     start = 4000
     before = estimator.run(parked.samples[:start])[-1].copy()
@@ -101,9 +100,8 @@ def test_capacity_and_ocv_are_learned_in_the_first_pass_of_the_curve_and_then_he
     load_a = np.tile(np.repeat([0.5, -0.5], 4320), 2) * TRUTH.cell.capacity_ah  # 0.6 of the capacity each way
     block = measured(load_a, 0.9, np.random.default_rng(1))[0]
     estimator = Estimator(load_cell("nca", TRUTH.cell.capacity_ah), initial_soc=0.9)
-    initial_mean = np.zeros_like(cell_estimates(estimator)[0])
     estimator.run(block[:7000])
-    assert not np.array_equal(cell_estimates(estimator)[0], initial_mean)
+    assert cell_estimates(estimator)[0].any()
     estimator.run(block[7000:8640])
     assert estimator.record[0]["filter"]["learned_soc"] == Noise().learning_soc
     mean, variance = cell_estimates(estimator)
@@ -157,13 +155,21 @@ def test_days_of_use_do_not_make_the_soc_overconfident() -> None:
     """The cell file is the generic one. Each pass of the curve shows the same errors of the file, and not new ones."""
     truth = replace(OXIDE, ocv_v=true_curve(Cycle("nca", "discharge", 1.0, 0.9)))
     current_a = days(np.random.default_rng(101), truth.capacity_ah, 4, 0.9)
-    case = Case("", truth, file_temperatures_c=(25.0,), load_before_h=0.0)
-    use = capture(case, current_a)
+    use = capture(Case("", truth, file_temperatures_c=(25.0,), load_before_h=0.0), current_a)
     estimator = Estimator(load_cell("nca", 1.01 * truth.capacity_ah), initial_soc=0.7)
     trace = estimator.run(use.samples)
     inside = np.abs(trace["soc"] - use.soc) < 2.0 * trace["soc_std"]
     assert inside[DAY_S : 2 * DAY_S].mean() > 0.95
     assert inside[2 * DAY_S :].mean() > 0.95
+
+
+def test_a_resistance_learned_near_empty_is_less_certain_near_full() -> None:
+    use = drive(CASES["oxide"], 0.4, hours=0.6)
+    estimator = Estimator(use.cell, initial_soc=0.4)
+    estimator.run(use.samples)
+    f = estimator.record[0]["filter"]
+    spawn_after_gap(f, estimator.settings_record[0]["filter"], np.inf, False)
+    assert (np.diff(f["covariance"][2:, LN_R, LN_R]) > 0.0).all()
 
 
 def test_an_empty_cell_rests_in_a_gap() -> None:

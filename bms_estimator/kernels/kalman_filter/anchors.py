@@ -29,9 +29,9 @@ from bms_estimator.kernels.kalman_filter.ekf import CHARGE_PAIR, HOLD_CELL, HOLD
 from bms_estimator.kernels.kalman_filter.mixture import (
     clear_hypothesis,
     copy_hypothesis,
-    decorrelate_state,
     mixture_moments,
     prune_and_merge,
+    scale_state,
 )
 from bms_estimator.kernels.kalman_filter.noise import bias_variance
 from bms_estimator.kernels.kalman_filter.records import B_FAST, B_SLOW, CURVE, LN_R, LN_R0, SOC, STATES, X
@@ -313,7 +313,7 @@ def restart_at_anchor(f: Record, ekf: Record, soc: float, variance: float) -> No
     f.count, f.best = 1, 0
     x, cov = f.mean[0], f.covariance[0]
     for j in (SOC, B_SLOW, B_FAST, CURVE):
-        decorrelate_state(x, cov, j)
+        scale_state(x, cov, j, 0.0)
     x[SOC], cov[SOC, SOC], cov[CURVE, CURVE] = soc, variance, 1.0
     cov[B_SLOW, B_SLOW] = cov[B_FAST, B_FAST] = 0.5 * bias_variance(f, ekf, 0)
     f.ln_weight[0] = f.minute_u[0] = f.ten_minutes_u[0] = 0.0

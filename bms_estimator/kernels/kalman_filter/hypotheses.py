@@ -34,9 +34,9 @@ from bms_estimator.kernels.kalman_filter.gap_charge import (
 from bms_estimator.kernels.kalman_filter.mixture import (
     clear_hypothesis,
     copy_hypothesis,
-    decorrelate_state,
     mixture_moments,
     prune_and_merge,
+    scale_state,
 )
 from bms_estimator.kernels.kalman_filter.noise import (
     bias_variance,
@@ -108,6 +108,8 @@ USER_SOC_STD = 0.03
 """Std of a correct SOC set by the user."""
 WRONG_USER_SOC_STD = 0.12
 """Std of a wrong SOC set by the user."""
+SHAPE_STD, SHAPE_CORRELATION_SOC = 0.15, 0.4
+"""Std and correlation length [SOC] of the relative error of the file's resistances over SOC."""
 LN_ODDS_CORRECT = 3.0
 """Additional log-weight of the hypothesis that the user's SOC is correct. All other hypotheses together have a probability
 of about 0.1."""
@@ -125,8 +127,7 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
     initialize_load_statistics(s, p, current_a)
     s.x_a[:] = 0.0
     x, cov = s.mean[0], s.covariance[0]
-    x[:] = 0.0
-    cov[:, :] = 0.0
+    x[:] = cov[:, :] = 0.0
     cov[LN_R0, LN_R0] = cov[LN_R, LN_R] = resistance_std(s, p) ** 2
     cov[LN_R0, LN_R] = cov[LN_R, LN_R0] = max(resistance_std(s, p) ** 2 - INDEPENDENT_R_STD**2, 0.0)
     s.learned_soc = s.gap_s = 0.0
@@ -173,9 +174,9 @@ def forget_state_of_charge(s: Record, p: Record, q: int) -> None:
     """
     mean, covariance = s.mean[q], s.covariance[q]
     for j in (SOC, B_SLOW, B_FAST, HYST, CURVE):
-        decorrelate_state(mean, covariance, j)
+        scale_state(mean, covariance, j, 0.0)
     for k in range(BRANCHES):
-        decorrelate_state(mean, covariance, X + k)
+        scale_state(mean, covariance, X + k, 0.0)
     initial_branch_currents(p, s.current_a, mean, covariance)
     covariance[HYST, HYST], covariance[CURVE, CURVE] = HYST_STD**2, 1.0
     s.minute_u[q] = s.ten_minutes_u[q] = 0.0
@@ -189,6 +190,19 @@ def set_initial_soc(s: Record, p: Record, q: int, soc: float, std: float) -> Non
     s.covariance[q, SOC, SOC] = std * std
     half_v2 = 0.5 * bias_variance(s, p, q)
     s.covariance[q, B_SLOW, B_SLOW] = s.covariance[q, B_FAST, B_FAST] = half_v2
+
+
+@njit(cache=True)
+def forget_scales(s: Record, p: Record, q: int, moved_soc: float) -> None:
+    """Reduce the learned scales of the resistances to their part that does not depend on the SOC, for an SOC ``moved_soc`` away.
+
+    The file's resistances have an error over SOC: a scale that was learned near empty is not that at full.
+    """
+    variance = resistance_std(s, p) ** 2
+    factor = 1.0 + math.expm1(-abs(moved_soc) / SHAPE_CORRELATION_SOC) * SHAPE_STD**2 / max(variance, SHAPE_STD**2)
+    for j in (LN_R0, LN_R):
+        scale_state(s.mean[q], s.covariance[q], j, factor)
+        s.covariance[q, j, j] += (1.0 - factor**2) * variance
 
 
 @njit(cache=True)
@@ -225,8 +239,7 @@ def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
     row = min(max(math.ceil(s.mean[kept, SOC] / spacing), 0), even_count)
     if row != kept:
         copy_hypothesis(s, kept, row)
-    for k in range(BRANCHES):
-        s.mean[row, X + k] += s.x_a[k]  # s.x_a becomes 0 below
+    s.mean[row, X : X + BRANCHES] += s.x_a  # s.x_a becomes 0 below
     # hypothesis ``first`` retains only the estimates of sensor and cell, and is copied to the other evenly spaced ones
     first = 1 if row == 0 else 0
     copy_hypothesis(s, row, first)
@@ -237,6 +250,7 @@ def spawn_after_gap(s: Record, p: Record, gap_s: float, rested: bool) -> None:
         if q != first:
             copy_hypothesis(s, first, q)
         set_initial_soc(s, p, q, n * spacing, OVERLAP * spacing)
+        forget_scales(s, p, q, n * spacing - s.mean[row, SOC])
         weight = event / even_count + (1.0 - event - kept_probability) * spacing * normal_density(n * spacing, soc, std)
         s.ln_weight[q] = math.log(max(weight, MIN_PROBABILITY))
     s.ln_weight[row] = math.log(max(kept_probability, MIN_PROBABILITY))

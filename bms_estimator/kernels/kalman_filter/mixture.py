@@ -16,20 +16,18 @@ MERGE_STDS = 0.7
 
 
 @njit(cache=True)
-def decorrelate_state(mean: Record, covariance: Record, j: int) -> None:
-    """Set state ``j`` to 0, with zero variance and covariances."""
-    mean[j] = 0.0
-    covariance[j, :] = 0.0
-    covariance[:, j] = 0.0
+def scale_state(mean: Record, covariance: Record, j: int, factor: float) -> None:
+    """Multiply state ``j`` by a factor, with its variance and covariances."""
+    mean[j] *= factor
+    covariance[j, :] *= factor
+    covariance[:, j] *= factor
 
 
 @njit(cache=True)
 def copy_hypothesis(s: Record, source: int, to: int) -> None:
     """Copy hypothesis ``source`` to ``to``."""
-    for j in range(STATES):
-        s.mean[to, j] = s.mean[source, j]
-        for k in range(STATES):
-            s.covariance[to, j, k] = s.covariance[source, j, k]
+    s.mean[to, :] = s.mean[source, :]
+    s.covariance[to, :, :] = s.covariance[source, :, :]
     s.ln_weight[to] = s.ln_weight[source]
     s.minute_u[to], s.ten_minutes_u[to] = s.minute_u[source], s.ten_minutes_u[source]
     s.fast_inflation[to], s.slow_inflation[to] = s.fast_inflation[source], s.slow_inflation[source]
