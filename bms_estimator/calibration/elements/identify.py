@@ -2,7 +2,8 @@
 
 ``ladder_fit`` fits the resistances, once with a corrected and once with the given OCV. The result is scored by replays of the
 estimator that start in mid-load, with the given and with the identified cell. If other captures at about the temperature of
-a capture were given, the replays of that capture use a fit without it (hold-out).
+a capture were given, the replays of that capture use a fit without it (hold-out). If such fits are rejected, the fit to all
+captures is scored: a fit without the only drive, or the only HPPC, extrapolates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,7 +56,7 @@ class Candidate:
 
     def __init__(self, runs: list[Run], equations: list[NormalEquations], cell: CellModel, *, refine_ocv: bool) -> None:
         self._runs, self._equations, self._cell, self._refine = runs, equations, cell, refine_ocv
-        self._scale_ohm = _resistance_scale(runs, cell)
+        self._scale_ohm, self.holds_back = _resistance_scale(runs, cell), True
         self.fit = self._fit(range(len(runs)))
 
     @cached_property
@@ -68,9 +69,13 @@ class Candidate:
         return [equations_of_run.miscount(self.fit.coefficients) for equations_of_run in self._equations]
 
     def is_held_back(self, j: int) -> bool:
-        """Return True if another capture within ``MIN_SPAN_K`` of the temperature of capture ``j`` was given."""
-        mean_c = [run.mean_c for run in self._runs]
-        return any(k != j and abs(mean_c[k] - mean_c[j]) < MIN_SPAN_K for k in range(len(mean_c)))
+        """Return True if another capture within ``MIN_SPAN_K`` of the temperature of capture ``j`` was given.
+
+        If ``holds_back`` is False, no capture is held back.
+        """
+        return self.holds_back and any(
+            k != j and abs(run.mean_c - self._runs[j].mean_c) < MIN_SPAN_K for k, run in enumerate(self._runs)
+        )
 
     def outcome(self, before: Floats, after: Floats, left_out: tuple[str, ...]) -> Identification:
         """Return the identification with this variant's cell.
@@ -223,6 +228,12 @@ def identify(
         )
         best = int((EQUAL_SCORE_RATIO if held_back else 1.0) * refined < given)  # index in ``candidates``
     outcome = candidates[best].outcome(before, after[best], left_out)
+    if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before and any(c.held_back for c in outcome.captures):
+        candidates[best].holds_back = False
+        own = candidates[best].outcome(
+            before, _scores(candidates[best], runs, WorkCounter(no_progress, samples)), left_out
+        )
+        outcome = min(outcome, own, key=lambda scored: scored.score_after)
     unknown = [clean for clean in excited if initial_soc is None and clean.name not in initial_socs]
     undetermined = tuple(
         f"{clean.name}: give the SOC at the start (--soc), because {text}"

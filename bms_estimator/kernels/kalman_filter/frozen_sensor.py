@@ -30,6 +30,11 @@ SWING_V = 0.02
 NOISE_STEPS = 4.0
 """A constant current is frozen only if the voltage changes by more than this multiple of its mean change between two samples.
 Noise contributes to that mean at each sample and therefore does not exceed the limit. A load changes the voltage seldom."""
+JUMP_SHARE = 0.125
+"""Weight of a jump in the mean size of the jumps, so that the mean is over about eight. Changes above half of ``SWING_V`` are jumps."""
+DITHER_SPREAD = 0.2
+"""Relative std of the jumps below which they are dither. A converter's jumps have one size, and those of loads differ.
+Jumps of more than twice ``SWING_V`` have another cause."""
 MIN_RESOLUTION_STEPS = 3.0
 """Minimum change of the voltage for a proof, in multiples of its resolution."""
 OCV_CHANGE_V = 0.01
@@ -78,6 +83,9 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
     # a charge that contradicts the voltage may also be due to a current that froze under load
     elif ocv_moved or (has_fast_changes and voltage_has_swung(c, p, counted_s, voltage_v, resolved_v)):
         c.frozen_a_s += counted_s
+        is_dither = c.jump_v < 2.0 * SWING_V * p.series and c.jump_v2 < (1.0 + DITHER_SPREAD**2) * c.jump_v**2
+        if is_dither and not ocv_moved and c.frozen_a_s - counted_s <= FROZEN_S:
+            c.frozen_a_s = min(c.frozen_a_s, 0.5 * FROZEN_S)
     elif c.frozen_a_s < FROZEN_S:  # discount single glitches at rest
         c.frozen_a_s -= c.frozen_a_s * min(1.0, counted_s / OUTLIERS_S)
     c.last_v, c.last_a = voltage_v, current_a
@@ -89,7 +97,12 @@ def detect_frozen_input(c: Record, f: Record, p: Record, dt_s: float, current_a:
 def voltage_has_swung(c: Record, p: Record, counted_s: float, voltage_v: float, resolved_v: float) -> bool:
     """Return True if a voltage change under a constant current exceeds the noise, and update the mean change."""
     share = counted_s / min(max(c.same_s, counted_s), OUTLIERS_S)  # a mean over the time of the constant current
-    c.noise_v += share * (abs(voltage_v - c.last_v) - c.noise_v)
+    change_v = abs(voltage_v - c.last_v)
+    c.noise_v += share * (change_v - c.noise_v)
+    # a jump; the voltage has relaxed after the last step of the current
+    if change_v > 0.5 * SWING_V * p.series and c.same_s > FROZEN_S:
+        share = 1.0 if c.jump_v == 0.0 else JUMP_SHARE
+        c.jump_v, c.jump_v2 = c.jump_v + share * (change_v - c.jump_v), c.jump_v2 + share * (change_v**2 - c.jump_v2)
     limit_v = max(SWING_V * p.series, resolved_v, NOISE_STEPS * c.noise_v)
     # the second difference is 0 for a steady drift of the voltage
     return abs(voltage_v - 2.0 * c.slow_v + c.slower_v) > limit_v

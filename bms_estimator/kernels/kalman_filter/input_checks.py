@@ -114,6 +114,8 @@ CHECKS = np.dtype(
         ("held_soc_std", "f8"),  # std of the SOC at the last change of the voltage
         ("same_s", "f8"),  # time since the last change of the current [s]
         ("noise_v", "f8"),  # mean change of the voltage between two samples while the current is constant [V]
+        ("jump_v", "f8"),  # mean size of the jumps of the voltage while the current is constant [V]; 0: none yet
+        ("jump_v2", "f8"),  # mean square of these jumps [V^2]
         ("same_soc", "f8"),  # SOC at the last change of the current
         ("same_soc_std", "f8"),  # std of the SOC at the last change of the current
         ("wrong_v", "f8"),  # running mean of the slow bias [V]

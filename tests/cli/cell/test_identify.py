@@ -120,3 +120,13 @@ def test_cell_file_with_worse_replays_is_not_written(tables, tmp_path, capsys, m
     assert "replays that start in mid-load get worse" in err
     assert "from 1.00 to 9.00 % of SOC" in err
     assert not out.exists()
+
+
+@pytest.mark.thorough
+def test_a_file_from_pulses_and_a_drive_is_written(tmp_path, capsys, shared_data):
+    """A fit to the pulses alone makes replays of the drive worse. The file that is fitted to both improves them."""
+    pulses, drive = (shared_data / "panasonic18650pf" / f"25_{name}.csv.gz" for name in ("hppc", "us06"))
+    assert run(capsys, "ocv", pulses, "--capacity-ah", "2.9", "--out", tmp_path / "ocv.toml")[0] == 0
+    assert not run(capsys, "identify", pulses, drive, "--cell", tmp_path / "ocv.toml", "--out", tmp_path / "own.toml")[
+        0
+    ]

@@ -129,14 +129,16 @@ def test_a_coarse_voltage_with_a_configured_resolution_is_not_frozen() -> None:
     assert not (suspects & FROZEN_FAULTS).any()
 
 
-def two_levels(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Return a voltage that changes at random between two levels 13 mV apart, after three samples on average [V]."""
-    return 0.013 * (np.cumsum(rng.random(size) < 1 / 3) % 2)
+def two_levels(rng: np.random.Generator, size: int, apart_v: float = 0.013, samples: int = 3) -> np.ndarray:
+    """Return a voltage that changes at random between two levels ``apart_v`` apart, after ``samples`` on average [V]."""
+    return apart_v * (np.cumsum(rng.random(size) < 1 / samples) % 2)
 
 
 @pytest.mark.parametrize("step_s", [1, 5, 10])
 @pytest.mark.parametrize(
-    "noise", [lambda rng, size: rng.normal(0.0, 0.013, size), two_levels], ids=["white", "two levels"]
+    "noise",
+    [lambda rng, size: rng.normal(0.0, 0.013, size), two_levels, lambda rng, size: two_levels(rng, size, 0.026, 30)],
+    ids=["white", "two levels", "two distant levels"],
 )
 @pytest.mark.parametrize("current_a", [0.0, 0.3], ids=["exactly 0 A", "constant offset"])
 def test_a_noisy_voltage_of_a_parked_pack_is_no_frozen_current(
