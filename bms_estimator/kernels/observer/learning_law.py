@@ -118,7 +118,7 @@ def learn_from_voltage(s: Record, p: Record, dt_s: float, voltage_v: float) -> N
 
 @njit(cache=True)
 def inject_output_error(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """Add a fraction of e to the offset, and update the offset's sensitivities; ``m.psi`` becomes that of y^ with offset."""
+    """Add a fraction of e to the offset, and update its sensitivities. ``m.psi`` becomes the sensitivity of y^ plus offset."""
     share = -math.expm1(-dt_s / q.offset_s)
     m.offset_v += share * e
     for j in range(q.count):
