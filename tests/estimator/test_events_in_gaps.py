@@ -167,7 +167,7 @@ def test_days_of_use_do_not_make_the_soc_overconfident() -> None:
 
 
 def test_an_empty_cell_rests_in_a_gap() -> None:
-    """Near empty the voltage of the pack is a std of the generic curve above it, as that of another SOC. No load was possible in the gap."""
+    """Near empty the voltage of the pack exceeds the generic curve by a std, as at a higher SOC. No load was possible in the gap."""
     generic = load_cell("lco", 2.0)
     assert isinstance(generic.ocv, TableOcv)
     above_v = np.interp(generic.ocv.soc, (0.0, 0.03, 0.15), (0.1, 0.1, 0.0))

@@ -50,7 +50,7 @@ class RecognizedCapture:
             known and comes near 1.
         is_ocv_test: True if the capture has low-rate curves or enough rests for an open-circuit voltage.
         gives_ocv: True if the capture determines the open-circuit voltage.
-        measures_ocv: True if it does so with low-rate curves, or with enough rests of some minutes.
+        measures_ocv: True if low-rate curves, or enough rests of some minutes, determine the open-circuit voltage.
         gives_resistances: True if its current is large enough for resistances.
         temperature_c: Mean temperature [°C]; NaN without a sensor.
     """

@@ -70,7 +70,7 @@ CLEAR_FRACTION = 0.7
 MAX_OCV_BIAS_V = 0.12
 """Mean bias of one cell above which the OCV counts as wrong [V]. An OCV of the cell's chemistry has smaller errors."""
 MAX_LEVEL_V = 0.03
-"""Maximum deviation of a plateau's voltage from that of the OCV curve, for one cell [V]. Beyond it the measured voltage counts as
+"""Maximum deviation of a plateau's voltage from the OCV curve, for one cell [V]. Beyond it the measured voltage counts as
 wrong. Makes of LFP differ by 11 mV."""
 OCV_BIAS_S = 1800.0
 """Averaging time of the mean bias that shows a wrong OCV [s]."""

@@ -199,7 +199,7 @@ def cholesky_factor(m: Record, q: Record) -> bool:
 def apply_parameter_step(m: Record, q: Record, share: float) -> None:
     """Move theta by ``share`` of the step within its bounds, and adjust the states to the new theta.
 
-    The accumulated sensitivities are those of earlier theta, so that information is discounted with the squared step.
+    The accumulated sensitivities belong to earlier values of theta. Information is therefore discounted with the squared step.
     """
     squared_step = 0.0
     for j in range(q.count):
