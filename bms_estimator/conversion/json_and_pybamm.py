@@ -82,7 +82,7 @@ def _docstring_text(text: str) -> str:
 
 
 def _array(values: Floats) -> str:
-    """Return a numpy array as Python text; the zeros of a missing column are not listed."""
+    """Return an array as Python text, in short form if it contains only zeros, as for a column that the cell file lacks."""
     if not values.any():
         return f"np.zeros({values.size})"
     return f"np.array([\n{value_lines(_numbers(values), 4)},\n])"

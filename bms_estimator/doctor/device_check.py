@@ -67,7 +67,7 @@ class FirstSample:
 
 
 def first_sample_timeout_s(settings: Settings) -> float:
-    """Return the time within which the device must send a sample [s]: at least two sample periods, and its longest silence."""
+    """Return the time within which the device must send a sample [s]: two sample periods, or longer if a setting permits silence."""
     silent_s = settings.source.max_silent_s if isinstance(settings.source, MqttSource) else None
     return max(MIN_FIRST_SAMPLE_TIMEOUT_S, 2.0 * settings.sensor.sample_period_s, silent_s or 0.0)
 
@@ -144,7 +144,7 @@ async def _first_sample(subject: ExaminedPack) -> FirstSample:
                         sample = FirstSample(float(last["voltage_v"]), float(last["current_a"]), dict(source.board), 0)
                         limit.reschedule(asyncio.get_running_loop().time() + CELLS_TIMEOUT_S)
                     sample = replace(sample, cells=max(sample.cells, int(cells)))
-                    if sample.cells == series or sample.board.get("bandgap_v"):
+                    if sample.cells == series or sample.board.get("bandgap_v"):  # a board measures no cells
                         break
         if sample is None:
             raise NoSampleError(source.silence_reason or f"no sample within {timeout_s:g} s")

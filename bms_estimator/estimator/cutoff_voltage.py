@@ -8,9 +8,9 @@ from bms_estimator.settings.pack import Settings
 
 
 def load_cutoff_v(settings: Settings, cell: CellModel) -> float:
-    """Return the terminal voltage at which the load is switched off, which ends the forecast [V].
+    """Return the terminal voltage at which the load is switched off and the forecast ends [V].
 
-    It is the first of these that is configured: ``pack.cutoff_v``, ``pack.cutoff_voltage_v``, the limit of the alarm
+    It is the first configured value of ``pack.cutoff_v``, ``pack.cutoff_voltage_v``, the limit of the alarm
     ``pack_under_voltage``; otherwise the OCV at SOC 0.
 
     Args:

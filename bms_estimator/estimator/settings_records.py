@@ -81,11 +81,11 @@ CONVERGED_ERROR = 2.0
 """Default error below which the observer counts as converged, in multiples of the larger of dead zone and converter step."""
 GAP_S = 5.0
 """Duration of a step above which it counts as a gap [s]; for a slow source, ``MAX_STEP_PERIODS`` of its periods."""
-CHECKED_C = 0.5
+MAX_UNCHECKED_C = 0.5
 """Maximum change of the current that is not checked by the voltage, as a C-rate. The charge of a wrong sample is small."""
-VISIBLE_DROP_V = 0.01
+MAX_UNCHECKED_DROP_V = 0.01
 """Maximum ohmic drop of one cell that is not checked by the voltage [V]."""
-VISIBLE_STEPS = 3.0
+MAX_UNCHECKED_STEPS = 3.0
 """Maximum ohmic drop that is not checked by the voltage, in steps of the voltage converter."""
 IMPROVED_INDICES = range(1, 13)
 """Indices of the a_i that the improved method adapts (Algorithm 1 of the thesis). a13..a15 follow from (4.2)."""
@@ -141,6 +141,7 @@ def estimator_settings(
     p["identify"] = identifier.enabled
     # only these laws have the form (3.18); (3.16) and (3.17) have no limit that the identifier could set
     p["sets_targets"] = observer.law in ("improved", "scheme-3")
+    # the identifier estimates R_s itself
     p["series_resistance"] = observer.law == "improved" and not identifier.enabled
     p["map_memory_s"] = identifier.map_memory_h * 3600.0
     p["configured"][1:] = cell.a[1:PARAMETERS]
@@ -174,9 +175,9 @@ def observer_settings(
     p["check_ohm"] = r_s(0.5, cell.a)
     p["check_slow_ohm"] = r_ts(0.5, cell.a) + r_tl(0.5, cell.a)
     p["check_v"] = max(
-        p["check_ohm"] * CHECKED_C * cell.cell.capacity_ah,
-        VISIBLE_DROP_V * cell.cell.series_count,
-        VISIBLE_STEPS * voltage_resolution_v,
+        p["check_ohm"] * MAX_UNCHECKED_C * cell.cell.capacity_ah,
+        MAX_UNCHECKED_DROP_V * cell.cell.series_count,
+        MAX_UNCHECKED_STEPS * voltage_resolution_v,
     )
     _adaptation(p, cell, observer)
     # the improved method has the output (4.1), which does not contain R_s
@@ -212,7 +213,6 @@ def gain_and_limits(p: np.void, cell: Rated, observer: ObserverSettings, voltage
     p["voltage_min_v"] = cell.voltage_min_v
     p["voltage_max_v"] = cell.voltage_max_v
     p["current_max_a"] = cell.current_max_a
-    _period_limits(p, EXACT)
 
 
 def _period_limits(p: np.void, sampling: Sampling) -> None:

@@ -15,7 +15,7 @@ from bms_estimator.numba_cache import njit
 CURVE_NODES, DIRECTION_NODES, SHAPE_NODES = 101, 51, 6
 """Number of SOC nodes of the OCV's error, of the direction-dependent error, and of the error of the resistances."""
 RESISTANCE_GROUPS = (0, 1, 1, 1, 2, 2, 2)
-"""Group of each resistance: 0 series resistance, 1 RC pairs up to 30 s, 2 slower RC pairs. Those of a group share a scale."""
+"""Group of each resistance: 0 series resistance, 1 RC pairs up to 30 s, 2 slower RC pairs. All resistances of a group share a scale."""
 MODEL_ROW = np.dtype(
     [
         ("one_c_a", "f8"),  # current of 1 C [A]

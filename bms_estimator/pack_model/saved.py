@@ -23,7 +23,7 @@ from bms_estimator.pack_model.unknowns import DIRECTIONS
 SAVED_MINIMA = 2
 """Number of a fit's minima that are saved. The next fit starts from two minima (``fit.starts``)."""
 _RESULT_COUNT = CURVE.stop
-"""Number of results of a fit. ``CURVE`` is the last part of them."""
+"""Number of results of a fit. The slice ``CURVE`` contains the last ones."""
 _SOC_RANGE = (-2.0, 3.0)
 """Plausible range of a fitted SOC, which the fit does not limit."""
 MAX_RESULT = 20.0
@@ -43,7 +43,7 @@ FIT_SHAPES = {
     "cost": (),
     "first_segment": (),
 }
-"""Fields of a fit on which the curves and the handed-over state depend, with their shapes."""
+"""Fields of a fit, with their shapes, that the filter needs when it adopts the fit (``handover``)."""
 _FIT_RANGES = {
     "elapsed_s": TIME,
     "segment": SEGMENT,
@@ -63,7 +63,7 @@ _FIT_RANGES = {
 _CURVE_UNKNOWNS = CURVE_NODES + DIRECTIONS * DIRECTION_NODES
 """Number of unknowns of the OCV's error and of the direction-dependent error."""
 BANK_PREFIX = "bank_"
-"""Prefix of the arrays of the first discharges of a bank and of the fit after them."""
+"""Prefix of the arrays of ``History.first_discharges``, the first discharges of a bank and the fit after them."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -118,8 +118,8 @@ def neutral_fit() -> PackFit:
 
 def history_arrays(history: History, fit: PackFit | None) -> dict[str, NDArray[Any]]:
     """Return history and fit as arrays by name."""
-    weak_s = np.array(history.weak_cell_times).reshape(-1, len(WeakCellTime._fields))
-    arrays = {"rows": history.rows, "weak_cell_times": weak_s, **curve_arrays(fit)}
+    weak_cell_times = np.array(history.weak_cell_times).reshape(-1, len(WeakCellTime._fields))
+    arrays = {"rows": history.rows, "weak_cell_times": weak_cell_times, **curve_arrays(fit)}
     if history.first_discharges is not None:
         arrays["bank_rows"] = history.first_discharges.rows
         arrays |= {BANK_PREFIX + name: array for name, array in curve_arrays(history.first_discharges.fit).items()}
@@ -150,7 +150,7 @@ def _rows(arrays: Arrays, name: str) -> NDArray[np.void]:
     """Return saved rows of a history."""
     rows = checked_rows(arrays.get(name))
     if rows.size > MAX_ROWS:
-        raise ValueError("it has too many rows")
+        raise ValueError("the history has too many rows")
     return rows
 
 

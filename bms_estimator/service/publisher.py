@@ -57,7 +57,7 @@ class Publisher:
     Args:
         settings: The pack's settings.
         pack: The pack; read only.
-        source: Supplies counters, message and board.
+        source: Supplies counters, the reason of a silence, and properties of the device.
         sinks: Destinations of the snapshots.
         clock: The clocks.
         status: State of the service around the pack.
@@ -99,7 +99,8 @@ class Publisher:
         self._cells_sent_s = -math.inf  # time of the last comparison of the cells, monotonic clock
         self.alarm_monitor = AlarmMonitor(settings, pack, source, clock, on_alarm, self._status.hooks)
         self._short_limit_a = short_limit_a(settings, cell)
-        self._logged_faults, self._contradiction = (0, False), False  # bits of ``InputFault``, and ``_contradiction``
+        self._contradiction = False  # True: the SOC contradicts the one that the device reports
+        self._logged_faults = 0, False  # bits of ``InputFault``, and ``_contradiction``, as last logged
         self._lag_s = 0.0
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
@@ -118,7 +119,7 @@ class Publisher:
 
     @property
     def wait_s(self) -> float:
-        """Time until a snapshot is overdue, which shows that no samples arrive [s]."""
+        """Time until a snapshot is overdue [s]. A snapshot is overdue only if no samples arrive."""
         return max(self._due_s + 0.5 * self.period_s - self._clock.monotonic(), 0.0)
 
     def add(self, received: ReceivedSamples, result: RunResult, cells_fault: str = "") -> None:
@@ -136,7 +137,7 @@ class Publisher:
         """Add the estimates without evaluating the alarms. Return True if a snapshot was published.
 
         ``add_to_alarms`` evaluates the alarms later, so that they do not delay the estimate. It also publishes the first snapshot,
-        because this snapshot lists the alarms that the first samples permit.
+        because this snapshot lists the alarms that the first samples raise.
         """
         if self._status.source_health:
             self._latency.add(self._status.source_health().block_age_s)

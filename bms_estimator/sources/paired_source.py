@@ -50,9 +50,10 @@ class PairedSource:
 
     @property
     def counters(self) -> Mapping[str, int]:
-        """Counters of the monitor, and those of the BMS with the suffix ``_of_bms``.
+        """Counters of the monitor, and counters of the BMS with the suffix ``_of_bms``.
 
-        Alarms count all ``*_errors`` as lost samples. Those of the BMS lose no sample of the monitor.
+        The suffix hides errors of the BMS from the alarms, which count all ``*_errors`` as lost samples: an error of the BMS
+        loses no sample of the monitor.
         """
         return {**self._monitor.counters, **{f"{name}_of_bms": count for name, count in self._bms.counters.items()}}
 

@@ -51,7 +51,7 @@ class ReceivedSamples(NamedTuple):
 class Source(Protocol):
     """Async iterator of samples, with fault counters.
 
-    The iterator of a device never ends by itself. That of a capture or a table ends with the last sample.
+    The iterator of a device never ends by itself. The iterator of a capture or a table ends with the last sample.
     """
 
     @property

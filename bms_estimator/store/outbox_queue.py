@@ -140,7 +140,7 @@ class OutboxQueue:
         return bool(self.stored) and len(self._ready) < PAGE // 2
 
     def put(self, message: Message, on_result: OnResult | None = None) -> None:
-        """Append a message, whose result ``on_result`` receives."""
+        """Append a message. ``on_result`` receives its result."""
         if on_result:
             self.on_result[self.next_number] = on_result
         self._tail.append(QueuedMessage(self.next_number, message))

@@ -31,8 +31,8 @@ from bms_estimator.pack_model.history import DAY_S
 from bms_estimator.pack_model.slow_fit import SlowFit
 
 CONTRADICTION_STD, AGREEMENT_STD = 3.0, 2.0
-"""Difference between the estimated SOC and the SOC of the device above which a contradiction is reported, and below which it is
-no longer reported, in standard deviations of the difference."""
+"""Limits of the difference between the estimated SOC and the SOC of the device, in std of the difference: a contradiction is
+reported above the first, until the difference is below the second."""
 DEVICE_SOC_SUSPICION = (
     "the SOC that the device reports contradicts the voltage: check that the OCV curve belongs to this cell's chemistry, the number of "
     "cells in series and the sign of the current; a device that counts charge is also wrong long after its last full charge"

@@ -57,7 +57,7 @@ class RowResult:
 
     @property
     def _estimate(self) -> tuple[float, float]:
-        """Estimated SOC of the weakest cell, and its std. The SOC of a row is that of its middle, and the true value that of its end."""
+        """Estimated SOC of the weakest cell, and its std. The SOC of a row belongs to its middle, and the true value to its end."""
         return self.weakest.weakest_soc(self.weakest.filter_soc - 0.5 * ROW_SOC)
 
 

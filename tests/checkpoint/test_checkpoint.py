@@ -268,7 +268,7 @@ async def test_each_cell_has_its_own_checkpoint(tmp_path: Path) -> None:
 
 
 def test_the_oldest_checkpoints_of_a_pack_name_are_removed_above_the_maximum_number(tmp_path: Path) -> None:
-    """A pack has one checkpoint for each cell model. Those of another pack are not removed."""
+    """A pack has one checkpoint for each cell model. Checkpoints of another pack are not removed."""
     estimator = compiled_estimator(SETTINGS, CELL)
     (tmp_path / "pack-2-0123abcd.npz").write_bytes(b"of another pack")
     for series in range(1, MAX_FILES + 4):

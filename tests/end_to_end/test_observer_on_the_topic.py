@@ -1,6 +1,6 @@
 """End-to-end test of Algorithm 1 of the thesis, the adaptive observer, from the serial line to the topic.
 
-The test checks delta1 and delta2, below which SOC the capacitances of the RC pairs are negative, and N, the observer's
+The test checks delta1 and delta2, the SOCs below which the capacitances of the RC pairs are negative, and N, the observer's
 gain. Numbers in parentheses are equations of the thesis.
 """
 

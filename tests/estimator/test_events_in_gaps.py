@@ -173,7 +173,7 @@ def test_a_resistance_learned_near_empty_is_less_certain_near_full() -> None:
 
 
 def test_an_empty_cell_rests_in_a_gap() -> None:
-    """Near empty the voltage of the pack is a std of the generic curve above it, as that of another SOC. No load was possible in the gap."""
+    """Near empty the voltage of the pack exceeds the generic curve by a std, as at a higher SOC. No load was possible in the gap."""
     generic = load_cell("lco", 2.0)
     assert isinstance(generic.ocv, TableOcv)
     above_v = np.interp(generic.ocv.soc, (0.0, 0.03, 0.15), (0.1, 0.1, 0.0))

@@ -158,7 +158,7 @@ def test_triangular_solutions() -> None:
 
 @pytest.mark.parametrize("segments", [1, 4])
 def test_cholesky_factor_of_sparse_columns(segments: int) -> None:
-    """The unknowns of one segment are the first. They are independent of those of other segments."""
+    """The unknowns of one segment are the first. They are independent of the unknowns of other segments."""
     cell = cell_curves()
     parts = [
         with_voltages(cell, measured_rows(cell, days=1, segment=k, gap_s=7200.0), Truth()) for k in range(segments)

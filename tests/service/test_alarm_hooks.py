@@ -236,7 +236,7 @@ FOUND_AFTER_THEIR_PARENT = (
     "(setsid {daemon} &)",
     "env -i {daemon} &",
 )
-"""Commands that start a daemon, which the hook also finds after the end of the script that started it."""
+"""Commands that start a daemon. The hook finds the daemon even after the end of the script that started it."""
 FOUND_DURING_ITS_PARENT = "env -i setsid {daemon} &"
 """Command that starts a daemon, which the hook finds only while the script runs."""
 

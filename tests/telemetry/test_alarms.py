@@ -917,7 +917,7 @@ def test_the_time_between_bursts_of_samples_counts_toward_a_delay(spacing_s: flo
 
 def test_isolated_gaps_do_not_count_toward_a_delay() -> None:
     alarms = make_evaluator({"pack_over_voltage": {"delay_s": 25.0}})
-    # gaps from 4 to 25 s, before which the voltage is above the limit and after which below, and from 199 to 220 s within
+    # a gap from 4 to 25 s, with the voltage above the limit before and below after it, and a gap from 199 to 220 s within
     # the time above the limit
     times_s = [*range(5), *range(25, 200), *range(220, 300)]
     block = np.zeros(len(times_s), dtype=SAMPLE)

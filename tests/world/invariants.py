@@ -66,7 +66,7 @@ class ProcessEnd(NamedTuple):
     """End of a process."""
 
     at_s: float
-    """Time at which it last ran [s], which is before a freeze that had not ended."""
+    """Time at which it last ran [s]: if it was frozen at its end, the begin of the freeze."""
     survival_age_s: float
     """Messages and acknowledgments older than this survive the end; infinite: all may be lost [s]."""
 

@@ -135,8 +135,8 @@ class Calibration:
         model: Model fitted to all captures; if that fit finds no resistances, the model without the data held back.
         capacity: Capacity that SOC was counted against.
         captures: The captures, and what each determines.
-        is_ocv_measured: True if low-rate curves, rests of some minutes, or given curves determine the OCV; False if it is that
-            of the given cell, or an estimate from short rests.
+        is_ocv_measured: True if low-rate curves, rests of some minutes, or given curves determine the OCV; False if the OCV
+            of the given cell is unchanged, or estimated from short rests.
         has_held_back_data: True if the data of the validation were held back from the fit.
         validation_data: Sentence that names the data of the validation.
         validations: Validation on the data that were held back; without such data, validations on all captures.

@@ -46,11 +46,11 @@ class RecognizedCapture:
         kind: Kind of the test, such as "relaxation test, 19 rests".
         slow_branches: Low-rate discharges and charges; empty if there are none.
         start: SOC at the first sample.
-        reaches_full: True if the SOC is known and comes near 1, or was given, so that the capture determines the open-circuit
-            voltage without others.
+        reaches_full: True if the capture alone suffices for an open-circuit voltage: its first SOC was given, or its SOC is
+            known and comes near 1.
         is_ocv_test: True if the capture has low-rate curves or enough rests for an open-circuit voltage.
         gives_ocv: True if the capture determines the open-circuit voltage.
-        measures_ocv: True if it does so with low-rate curves, or with enough rests of some minutes.
+        measures_ocv: True if low-rate curves, or enough rests of some minutes, determine the open-circuit voltage.
         gives_resistances: True if its current is large enough for resistances.
         temperature_c: Mean temperature [°C]; NaN without a sensor.
     """
@@ -154,7 +154,7 @@ def _has_long_rests(test: RelaxationTest) -> bool:
 def _are_curves_usable(slow: Sequence[SlowBranch], cell: CellModel) -> bool:
     """Return True if low-rate curves are long enough, and their SOC is known.
 
-    It is known by the start of discharges; without a discharge, by the end of charges with a full cell.
+    The SOC of discharges is known if the SOC at their start is. Without a discharge, charges must end with a full cell.
     """
     if max((branch.ah[-1] for branch in slow), default=0.0) < MIN_SPAN * cell.cell.capacity_ah:
         return False

@@ -1,9 +1,9 @@
 """Identification of a cell from captures: RC ladder, a1..a15 of two equivalent RC pairs, corrected OCV.
 
 ``ladder_fit`` fits the resistances, once with a corrected and once with the given OCV. The result is scored by replays of the
-estimator that start in mid-load, with the given and with the identified cell. If other captures at about the temperature of
-a capture were given, the replays of that capture use a fit without it (hold-out). If such fits are rejected, the fit to all
-captures is scored: a fit without the only drive, or the only HPPC, extrapolates.
+estimator that start in mid-load, with the given and with the identified cell. A capture is held back if another one has about
+its temperature: its replays then use a fit to the other captures. If such fits are rejected, the fit to all captures is
+scored, because a fit without the only drive, or the only HPPC, extrapolates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -65,17 +65,16 @@ class Candidate:
         return self._cell_from(self.fit, range(len(self._runs)))
 
     def miscounts(self) -> list[float]:
-        """Return the additional relative error of each capture's charge count at which its voltage matches the fit."""
+        """Return, for each capture, the relative correction of its counted charge with which its voltage matches the fit best."""
         return [equations_of_run.miscount(self.fit.coefficients) for equations_of_run in self._equations]
 
     def is_held_back(self, j: int) -> bool:
-        """Return True if another capture within ``MIN_SPAN_K`` of the temperature of capture ``j`` was given.
+        """Return True if the fit omits capture ``j`` for its score, because another one is within ``MIN_SPAN_K`` of its temperature.
 
-        If ``holds_back`` is False, no capture is held back.
+        If ``holds_back`` is False, the fit omits none.
         """
-        return self.holds_back and any(
-            k != j and abs(run.mean_c - self._runs[j].mean_c) < MIN_SPAN_K for k, run in enumerate(self._runs)
-        )
+        mean_c = [run.mean_c for run in self._runs]
+        return self.holds_back and any(k != j and abs(mean_c[k] - mean_c[j]) < MIN_SPAN_K for k in range(len(mean_c)))
 
     def outcome(self, before: Floats, after: Floats, left_out: tuple[str, ...]) -> Identification:
         """Return the identification with this variant's cell.
@@ -115,7 +114,7 @@ class Candidate:
         )
 
     def cell_for(self, j: int) -> CellModel:
-        """Return the cell whose score capture ``j`` determines. Its fit omits this capture if it is held back."""
+        """Return the cell for the replays of capture ``j``. Its fit omits this capture if it is held back."""
         if not self.is_held_back(j):
             return self.cell
         others = [k for k in range(len(self._runs)) if k != j]
@@ -246,7 +245,7 @@ def identify(
 
 
 def _scores(candidate: Candidate, runs: list[Run], work: WorkCounter) -> Floats:
-    """Return the score of each capture's replays [%]. For a capture that is held back, the fit omits this capture."""
+    """Return the score of each capture's replays with ``Candidate.cell_for`` [%]."""
     return np.array(
         [
             interval_score(candidate.cell_for(j), run.capture, run.soc, work.part(run.soc.size))
@@ -272,7 +271,7 @@ def _worse_replays(outcome: Identification) -> str:
         if np.isfinite(c.score_after)
     ]
     return (
-        "replays that start in mid-load get worse, their interval score (smaller is better) goes from "
+        "replays that start in mid-load get worse: their interval score (smaller is better) goes from "
         f"{outcome.score_before:.2f} to {outcome.score_after:.2f} % of SOC; nothing is written: keep the cell file, or give "
         f"captures with more typical loads\n" + "\n".join(lines)
     )

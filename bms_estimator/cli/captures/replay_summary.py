@@ -42,7 +42,7 @@ class ReplayResult:
     """Standard deviation that the identifier estimates; None if the identifier is off."""
     soc_rms_difference_to_coulomb: float | None
     innovation_rms_v: float | None
-    """RMS of measured minus predicted voltage, before the correction by the measurement. Without the identifier, that of the observer."""
+    """RMS of measured minus predicted voltage, before the correction by the measurement; without the identifier, the observer's."""
     tracking_error_rms_v: float | None
     """RMS of the observer's tracking error e, (3.15)."""
     lock_lost: bool

@@ -193,8 +193,8 @@ def _has_port(host: str) -> bool:
 def _accounts(settings: FleetSettings, location: NodeLocation) -> Accounts | None:
     """Return the accounts of the tenants; None without tenants.
 
-    The first node creates the keys of the tenants, and so does any node to which the operator's key was copied. Other
-    nodes read the claims that the first node has written.
+    The first node, and each node to which the operator's key was copied, creates the keys of the tenants. Other nodes
+    read the claims that the first node has written.
 
     Raises:
         UserError: The keys or the claims cannot be read, or the claims were not copied to this node.

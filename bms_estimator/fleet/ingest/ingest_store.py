@@ -116,7 +116,7 @@ class IngestStore:
         return next_number - self._first_unconfirmed.get(pack, next_number)
 
     async def request_confirmation(self, pack: str) -> None:
-        """Send the last block with a multiple of ``CONFIRM_EVERY`` as number again, because workers confirm such a block."""
+        """Send again the last block whose number is a multiple of ``CONFIRM_EVERY``, because workers confirm such a block."""
         number = (self._open_blocks.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY
         if number >= self._first_unconfirmed.get(pack, 1):
             await self.publisher.send_one_again(pack, number)
@@ -138,7 +138,7 @@ class IngestStore:
         except (NotFoundError, BlockError):
             self._open_blocks.set_position(pack, NO_POSITION)
             return
-        self._set_end(pack, block.store_created_ns, last_sample_s(block))
+        self._begin_store_after(pack, block.store_created_ns, last_sample_s(block))
 
     def add(self, pack: str, batch: BatchSamples, arrival_s: float, sequence: int) -> Selection:
         """Add the new samples of a batch (``OpenBlocks.add``)."""
@@ -211,7 +211,7 @@ class IngestStore:
         """Process a worker's request: delete confirmed blocks, and send missing ones again."""
         pack = message.subject.split(".")[1]
         if pack not in self._open_blocks:
-            return  # a pack with an edge
+            return  # the edge of this pack stores its blocks
         try:
             request = BlockRequest.model_validate_json(message.data)
         except ValidationError:
@@ -221,23 +221,23 @@ class IngestStore:
         created_ns = position.created_s * NS_PER_S
         if request.store > created_ns or (request.store == created_ns and request.number > position.next_number):
             log.warning("a worker has later blocks of this pack than this store: a new store is begun", pack=pack)
-            self._begin_store(pack, request.store)
+            self._replace_store(pack, request.store)
         elif request.store == created_ns:
             self._first_unconfirmed[pack] = max(self._first_unconfirmed.get(pack, 0), request.number)
             self._confirmed[pack] = self._first_unconfirmed[pack]
             if request.resend:
                 self.publisher.request_resend(pack, request.number)
 
-    def _begin_store(self, pack: str, other_ns: int) -> None:
+    def _replace_store(self, pack: str, other_ns: int) -> None:
         """Replace the store of a pack by a new one, created later than ``other_ns`` [ns since 1970].
 
         Workers ignore the blocks of the former store. The samples of the open block are dropped.
         """
         last_s = self._open_blocks.position(pack).last_s
         self.remove(pack)
-        self._set_end(pack, other_ns, last_s)
+        self._begin_store_after(pack, other_ns, last_s)
 
-    def _set_end(self, pack: str, store_ns: int, last_s: float) -> None:
+    def _begin_store_after(self, pack: str, store_ns: int, last_s: float) -> None:
         """Begin a store with the first sample after ``last_s`` and after the creation of another store."""
         created_s = math.ceil(store_ns / NS_PER_S) + 1  # a sample after this time creates a store after the other one
         self._open_blocks.set_position(pack, PackPosition(0, 1, max(last_s, created_s)))

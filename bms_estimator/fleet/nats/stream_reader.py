@@ -80,7 +80,7 @@ async def _fetch_batch(nc: Client, stream: str, request: dict[str, object]) -> t
 
 
 async def _collect(responses: Subscription, stream: str) -> tuple[list[StoredMessage], bool]:
-    """Receive the messages of one batch up to the status that ends it. The result is that of ``_fetch_batch``."""
+    """Receive the messages of one batch up to the status that ends it. Return the same values as ``_fetch_batch``."""
     batch = list[StoredMessage]()
     while True:
         try:

@@ -44,14 +44,14 @@ FILES = {
 
 @contextlib.asynccontextmanager
 async def fleet_page(
-    server: Server, settings: PageSettings, hours: Path | None = None, *, overview_s: float = OVERVIEW_S
+    server: Server, settings: PageSettings, hours_folder: Path | None = None, *, overview_s: float = OVERVIEW_S
 ) -> AsyncIterator[str]:
     """Serve the page while the context lasts.
 
     Args:
         server: Address of the fleet's server.
         settings: Address and access of the page.
-        hours: Folder of the Parquet files for queries; None: without queries.
+        hours_folder: Folder of the Parquet files for queries; None: without queries.
         overview_s: Interval between two overviews [s].
 
     Yields:
@@ -77,8 +77,8 @@ async def fleet_page(
         FleetFeed(server, view, latest.set_link_state),
     ):
         tasks = [asyncio.create_task(_send_overviews(view, latest, overview_s), name="fleet page")]
-        if hours is not None:
-            tasks.append(asyncio.create_task(_send_query_results(hours, latest), name="fleet queries"))
+        if hours_folder is not None:
+            tasks.append(asyncio.create_task(_send_query_results(hours_folder, latest), name="fleet queries"))
         try:
             yield page.url
         finally:
@@ -93,7 +93,7 @@ async def _send_overviews(view: FleetView, latest: LatestValues, overview_s: flo
         await asyncio.sleep(overview_s)
 
 
-async def _send_query_results(hours: Path, latest: LatestValues) -> None:
+async def _send_query_results(hours_folder: Path, latest: LatestValues) -> None:
     """Run the queries every ``QUERY_S``.
 
     A query of a large fleet takes seconds. The process ends only after it, because a thread cannot be cancelled.
@@ -101,7 +101,7 @@ async def _send_query_results(hours: Path, latest: LatestValues) -> None:
     from bms_estimator.fleet.page.query_results import PAGE_QUERIES, run_page_query  # noqa: PLC0415 - only queries need duckdb
 
     while True:
-        results = {name: await asyncio.to_thread(run_page_query, hours, name) for name in PAGE_QUERIES}
+        results = {name: await asyncio.to_thread(run_page_query, hours_folder, name) for name in PAGE_QUERIES}
         latest.set_value(ANSWERS_KEY, json.dumps(results, allow_nan=False, separators=(",", ":")))
         await asyncio.sleep(QUERY_S)
 

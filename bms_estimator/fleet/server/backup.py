@@ -3,9 +3,9 @@
 The server takes the snapshots of the streams one after another, while workers and edges continue. ``BACKUP_ORDER`` makes the
 snapshots consistent:
 
-- The pointers to the checkpoints come before the checkpoints, because a worker writes a checkpoint before the pointer to it. If
-  a worker replaces the last two checkpoints of a pointer during the backup, the first checkpoint of the day remains, which the
-  pointer also names.
+- The pointers to the checkpoints come before the checkpoints, because a worker writes a checkpoint before the pointer to it. A
+  pointer names the last two checkpoints and the first one of the day. If a worker replaces the last two during the backup, the
+  first one of the day remains.
 - ``RAW`` comes after the checkpoints, so that it has the messages that follow each checkpoint.
   ``HOURS``, ``DEAD`` and ``HISTORY`` also come after the checkpoints, because a worker sends to them before it writes a
   checkpoint.

@@ -29,7 +29,7 @@ MAX_CHARGE_S = 0.1
 """Maximum processor time that is charged for one block [s], the cost of 20,000 samples. The first block may take longer,
 because it compiles kernels."""
 MAX_PACKS = 10_000
-"""Number of stored bucket levels above which the levels of idle packs, which are 0, are removed."""
+"""Number of stored bucket levels above which levels of 0 are removed: those packs are idle."""
 
 
 class CpuBudget:

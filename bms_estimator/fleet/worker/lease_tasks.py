@@ -175,7 +175,7 @@ class PeriodicStorage:
         return now_s + self._interval_s * (number + 1) / self._partitions
 
     async def save(self, leases: Sequence[PartitionLease]) -> None:
-        """Write the due checkpoints, and replace those that a live worker cannot read."""
+        """Write the due checkpoints, and again those whose format is too new for another live worker."""
         for lease in sorted(leases, key=lambda each: each.checkpoint_due_s):
             now_s = time.monotonic()
             if (lease.checkpoint_due_s <= now_s or lease.is_checkpoint_too_new) and self._nc.is_connected:

@@ -21,8 +21,8 @@ LOW_ACTIVATION_ENERGY = 12e3
 """Activation energy of the weak part of each resistance [J/mol]. This part depends weakly on temperature, like the electrolyte's
 resistance."""
 HIGH_ACTIVATION_ENERGY = 45e3
-"""Activation energy of the strong part of each resistance [J/mol]. This part depends strongly on temperature, like those of
-reaction and diffusion."""
+"""Activation energy of the strong part of each resistance [J/mol]. This part depends strongly on temperature, like the
+resistances of reaction and diffusion."""
 HYSTERESIS_ACTIVATION_ENERGY = 8e3
 """Activation energy of the hysteresis [J/mol]. Between C/30 curves of an LFP cell, less the drop of its RC network, the
 hysteresis at 5 and -15 C was 1.2 and 1.7 times that at 25 C."""

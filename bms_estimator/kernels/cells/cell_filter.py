@@ -198,9 +198,9 @@ def pack_range_v(c: Record, p: Record, soc: float, soc_std: float) -> float:
 
 @njit(cache=True)
 def is_steep_near_full(p: Record) -> bool:
-    """Return True if the OCV curve is much steeper near full than in its middle, as that of LFP.
+    """Return True if the OCV curve is much steeper near full than in its middle, as with LFP.
 
-    There, an error of the pack's SOC changes the voltage of the fullest cell relative to the others as much as a large short.
+    Near full, an error of the pack's SOC changes the voltage of the fullest cell relative to the others as much as a large short.
     ``p`` is a record of EKF_SETTINGS.
     """
     last = p.ocv_v.size - 1

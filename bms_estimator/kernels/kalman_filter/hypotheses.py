@@ -430,7 +430,7 @@ def detect_exchange(s: Record) -> None:
 def normalized_bias_squared(s: Record, p: Record, q: int) -> float:
     """Return the squared bias of a hypothesis over its prior variance.
 
-    The variance includes errors of OCV and hysteresis, which the biases also absorb and which dominate on a plateau.
+    The variance includes errors of OCV and hysteresis, because the biases absorb them, too. On a plateau they dominate.
     """
     bias_v, soc = s.mean[q, B_SLOW] + s.mean[q, B_FAST], s.mean[q, SOC]
     hysteresis_v = s.hysteresis * on_grid(soc, p.hysteresis_v)

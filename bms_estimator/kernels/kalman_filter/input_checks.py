@@ -64,13 +64,13 @@ OFFSET_STDS = 4.0
 CAPACITY_STDS = 2.0
 """Limit of the capacity for the fault CAPACITY, in multiples of its initial std."""
 PRESENT_STDS = 3.0
-"""Minimum offset or LN_Q for the faults OFFSET and CAPACITY, in multiples of the present std of each."""
+"""Minimum of the states OFFSET and LN_Q for the faults OFFSET and CAPACITY, in multiples of the state's present std."""
 CLEAR_FRACTION = 0.7
 """Fraction of its limit below which a fault ends (hysteresis)."""
 MAX_OCV_BIAS_V = 0.12
 """Mean bias of one cell above which the OCV counts as wrong [V]. An OCV of the cell's chemistry has smaller errors."""
 MAX_LEVEL_V = 0.03
-"""Maximum deviation of a plateau's voltage from that of the OCV curve, for one cell [V]. Beyond it the measured voltage counts as
+"""Maximum deviation of a plateau's voltage from the OCV curve, for one cell [V]. Beyond it the measured voltage counts as
 wrong. Makes of LFP differ by 11 mV."""
 OCV_BIAS_S = 1800.0
 """Averaging time of the mean bias that shows a wrong OCV [s]."""
@@ -119,7 +119,7 @@ CHECKS = np.dtype(
         ("same_soc", "f8"),  # SOC at the last change of the current
         ("same_soc_std", "f8"),  # std of the SOC at the last change of the current
         ("wrong_v", "f8"),  # running mean of the slow bias [V]
-        ("searches", "f8"),  # number of SOC re-initializations, discounted with REINITIALIZATIONS_S
+        ("searches", "f8"),  # number of recent increments of EKF_STATE.reopened, discounted with REINITIALIZATIONS_S
         ("seen_reopened", "i8"),  # value of EKF_STATE.reopened at the last check
         ("suspects", "i8"),  # bits of model.input_faults.InputFault
         ("good_mean", "f8", STATES),  # mean of the most likely hypothesis in the last good state
@@ -135,7 +135,7 @@ CHECKS = np.dtype(
 COUNTERS = np.dtype(
     [
         ("gated", "i8"),  # samples rejected by the innovation gate
-        ("reopened", "i8"),  # runs of samples beyond the gate that were accepted
+        ("reopened", "i8"),  # accepted runs of samples beyond the gate; not EKF_STATE.reopened
         ("reset", "i8"),  # restorations of the last good state because a value was not finite
     ],
     align=True,
@@ -293,9 +293,10 @@ def sign_is_wrong(c: Record, p: Record) -> bool:
 def coast_without_voltage(c: Record, f: Record, p: Record, dt_s: float, current_a: float) -> None:
     """Process a sample without its voltage, during a fault of ``UNUSABLE``.
 
-    Before a wrong sign of the current is found, it leads the filter to any SOC. A frozen current may be any typical load.
-    When the fault ends, the SOC is re-initialized. After a wrong current, so are offset, capacity and OCV, which the filter
-    learned from it until the fault was found, unless their learning had ended before.
+    Before a wrong sign of the current is found, it leads the filter to any SOC. While the reported current is frozen, the true
+    current may be that of any typical load. When the fault ends, the SOC is re-initialized. After a fault of the current,
+    offset, capacity and OCV are re-initialized, too, because the filter learned them from wrong currents until the fault was
+    found. They remain if they were learned before (``learning_soc``).
     """
     error_soc = UNOBSERVED_CHARGE_ERROR * abs(current_a) * min(dt_s, p.unmeasured_s) / p.capacity_as
     if c.suspects & CURRENT:
@@ -353,15 +354,15 @@ def update_input_faults(c: Record, f: Record, p: Record, dt_s: float) -> None:
 
 @njit(cache=True)
 def plateau_level_bit(f: Record, p: Record, before: int) -> int:
-    """Return the bit of the fault LEVEL. After the filter has learned the level in the first pass, the fault remains.
+    """Return the bit of the fault LEVEL. Only the first pass of the OCV curve sets or clears it, while the level is learned.
 
     Args:
         f: Record of EKF_STATE.
         p: Record of EKF_SETTINGS.
         before: Bits of the faults before this update.
     """
-    if p.node_correlation == NODE_CORRELATION or f.learned_soc >= p.learning_soc:  # no plateau, or nodes at their prior
-        return before & LEVEL
+    if p.node_correlation == NODE_CORRELATION or f.learned_soc >= p.learning_soc:
+        return before & LEVEL  # no plateau or a fitted curve; or the first pass has ended, which resets the nodes
     middle = NODES // 2
     scale_v = node_error_scale(p, 0.5, 0.0)
     level_v = scale_v * f.mean[f.best, NODE + middle]

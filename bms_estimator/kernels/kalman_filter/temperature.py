@@ -26,7 +26,7 @@ TEMPERATURE_S = 10.0
 """Averaging time of a temperature sensor's noise [s]."""
 
 MAX_RATE_K_S = 0.1
-"""Maximum rate of a cell's temperature [K/s]."""
+"""Maximum rate of change of a cell's temperature [K/s]."""
 
 RATE_LIMIT_DELAY_S = 60.0
 """Delay until the rate limit of the temperature applies [s], because some sensors report 85 C at first."""

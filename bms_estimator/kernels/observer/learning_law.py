@@ -118,7 +118,7 @@ def learn_from_voltage(s: Record, p: Record, dt_s: float, voltage_v: float) -> N
 
 @njit(cache=True)
 def inject_output_error(m: Record, q: Record, dt_s: float, e: float) -> None:
-    """Add a fraction of e to the offset, and update the offset's sensitivities; ``m.psi`` becomes that of y^ with offset."""
+    """Add a fraction of e to the offset, and update its sensitivities. ``m.psi`` becomes the sensitivity of y^ plus offset."""
     share = -math.expm1(-dt_s / q.offset_s)
     m.offset_v += share * e
     for j in range(q.count):
@@ -199,7 +199,7 @@ def cholesky_factor(m: Record, q: Record) -> bool:
 def apply_parameter_step(m: Record, q: Record, share: float) -> None:
     """Move theta by ``share`` of the step within its bounds, and adjust the states to the new theta.
 
-    The accumulated sensitivities are those of earlier theta, so that information is discounted with the squared step.
+    The accumulated sensitivities belong to earlier values of theta. Information is therefore discounted with the squared step.
     """
     squared_step = 0.0
     for j in range(q.count):

@@ -6,12 +6,12 @@ With the minus sign, (3.10) is a Nussbaum function (Li & Chen, Automatica 2009).
     E_a(-r^a) = (2/a) e^(r cos(pi/a)) cos(r sin(pi/a)) + G_a(r),
     G_a(r) = (sin(pi a)/pi) int_0^inf e^(-r s) s^(a-1) / (s^(2a) + 2 s^a cos(pi a) + 1) ds.
 
-Substituting s^a = -cos(pi a) + sin(pi a) tan(theta) turns G into a mean of exponentials without the pole that
-approaches the real axis as a approaches 3,
+As a approaches 3, a pole of the integrand approaches the real axis. Substituting s^a = -cos(pi a) + sin(pi a) tan(theta) removes
+it and turns G into a mean of exponentials:
 
-    G_a(r) = 1/(pi a) int e^(-r s(theta)) d theta,    from s(theta) = 0 to s(theta) = inf,
+    G_a(r) = 1/(pi a) int e^(-r s(theta)) d theta,    from s(theta) = 0 to s(theta) = inf.
 
-which is tabulated over 1/(1 + r) once per a. Near r = 0, where G is not smooth because of a term r^a, the power series
+This mean is tabulated over 1/(1 + r) once per a. Near r = 0, G is not smooth because of a term r^a. There, the power series
 (3.11) is used.
 """
 

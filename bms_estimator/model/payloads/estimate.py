@@ -65,8 +65,8 @@ class Estimate(Payload):
         ),
     ] = Field(description="state of charge [%]")
     soc_std: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
-        description="standard deviation of soc; for cells in series it includes the weakest cell, a tenth of the "
-        "charge drawn; null without the identifier"
+        description="standard deviation of soc; for cells in series it includes the weakest cell's, "
+        "0.1 (1 - soc); null without the identifier"
     )
     soc_known: bool = Field(
         description="true: soc_std was below 0.12 and has not risen above 0.15 since, or there is no identifier; false: soc is "
@@ -111,8 +111,8 @@ class Estimate(Payload):
         description="median time until the load is switched off at the cut-off voltage [s], under a load like the observed one; "
         "below 600 s use the quantiles and probabilities; null with a forecast_reason"
     )
-    time_to_cutoff_p05_s: float | None = Field(description="5 % quantile of this time [s]")
-    time_to_cutoff_p95_s: float | None = Field(description="95 % quantile of this time [s]")
+    time_to_cutoff_p05_s: float | None = Field(description="5 % quantile of the time until the cut-off [s]")
+    time_to_cutoff_p95_s: float | None = Field(description="95 % quantile of the time until the cut-off [s]")
     cutoff_within_2min: Annotated[float | None, Quantity(prometheus="ratio")] = Field(
         description="probability that the load is switched off within 2 min of the forecast, 0..1"
     )
@@ -160,7 +160,7 @@ class Estimate(Payload):
     weakest_cell_capacity: Annotated[
         float | None,
         Quantity(
-            raw_entity("Weakest cell, capacity of the others", "%", 0)._replace(factor=100.0),
+            raw_entity("Weakest cell, relative capacity", "%", 0)._replace(factor=100.0),
             packs="batteries",
             prometheus="ratio",
         ),
@@ -190,15 +190,15 @@ class Estimate(Payload):
     )
     charge_out_ah: Annotated[
         float, Quantity(total_entity("Charge out", "Ah", 2)._replace(enabled=False), prometheus="counter")
-    ] = Field(description=f"discharged {_COUNTED} [Ah]")
+    ] = Field(description=f"charge out of the pack [Ah], {_COUNTED}")
     charge_in_ah: Annotated[
         float, Quantity(total_entity("Charge in", "Ah", 2)._replace(enabled=False), prometheus="counter")
-    ] = Field(description=f"charged {_COUNTED} [Ah]")
+    ] = Field(description=f"charge into the pack [Ah], {_COUNTED}")
     energy_out_kwh: Annotated[float, Quantity(total_entity("Energy out", "kWh", 3, "energy"), prometheus="counter")] = (
-        Field(description=f"discharged {_COUNTED} [kWh]")
+        Field(description=f"energy out of the pack [kWh], {_COUNTED}")
     )
     energy_in_kwh: Annotated[float, Quantity(total_entity("Energy in", "kWh", 3, "energy"), prometheus="counter")] = (
-        Field(description=f"charged {_COUNTED} [kWh]")
+        Field(description=f"energy into the pack [kWh], {_COUNTED}")
     )
     equivalent_cycles: Annotated[
         float | None, Quantity(total_entity("Full cycles", None, 2)._replace(icon="sync"), packs="batteries")

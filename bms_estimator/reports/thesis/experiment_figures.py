@@ -39,7 +39,7 @@ def figure_26(experiment: Experiment) -> Figure:
         grid = np.linspace(0.0, 1.0, 600)
         for color, test in zip(np.resize(COLORS, len(p.tests)), p.tests, strict=True):
             axes[0].errorbar(test.soc, test.ocv_v, 2.0 * test.std_v, fmt="o", ms=3, color=color, label=test.name)
-        if experiment.recorded is None:  # Table 8 is of the pack that is simulated
+        if experiment.recorded is None:  # Table 8 describes the simulated pack, not a recorded one
             axes[0].plot(
                 grid, chen_mora(np.array(printed_values.TABLE_8), grid), ":", linewidth=2.4, label="(2.10), Table 8"
             )
@@ -115,7 +115,7 @@ def figure_29(experiment: Experiment) -> Figure:
         "R_ts·C_ts and R_tl·C_tl as estimated",
         plot(lambda axes: products_plot(axes, None, run.average), columns=2, salt="figure-29"),
         experiment,
-        "The products are those of the limits to which a1..a12 converge, which the bounds define (E3).",
+        "a1..a12 converge to limits that the bounds define (E3). The products are those of these limits.",
         claims=("RC products",),
     )
 

@@ -31,7 +31,7 @@ _ALARM_AVAILABILITY = "{{ 'online' if value_json.watched or value_json.active el
 FORMER_SENSORS = ("r_s_ohm",)
 """Keys of sensors of former versions, which Home Assistant removes."""
 _SOC_HINT = "{{ {'hint': '' if value_json.soc_percent is number else 'not known yet: charge the pack to full once, or let it rest for ten minutes'} | tojson }}"
-"""Template of the attribute that says what helps while the state of charge is not known."""
+"""Template of the attribute ``hint``, which names the remedy while the state of charge is not known."""
 NAMEABLE = {*BATTERY, *FUEL_CELL, *CELL_VOLTAGES, CELL, *ALARMS, *get_args(Command)}
 """Entities that ``[home_assistant.names]`` may rename."""
 
@@ -180,7 +180,7 @@ def _attributes(root: str, template: str | None) -> dict[str, str]:
 
 
 def _alarm(name: str, root: str) -> dict[str, Any]:
-    """Return the sensor of an alarm: on while raised; otherwise off, unknown like its value, or unavailable if not monitored."""
+    """Return the sensor of an alarm: on while raised; otherwise off, unknown while its value is, or unavailable if not monitored."""
     topic = f"{root}/alarm/{name}"
     return {
         "platform": "binary_sensor",
@@ -198,10 +198,10 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
 def _controls(root: str) -> dict[str, dict[str, Any]]:
     """Return the controls by command.
 
-    That of the SOC shows the last set value, because the live SOC would add a row to the recorder with each change. The button that
+    The control of the SOC shows the last set value, because the live SOC would add a row to the recorder with each change. The button that
     discards what was learned is disabled, because a press cannot be undone.
     """
-    service = dict[str, Any](availability=[{"topic": f"{root}/availability"}])  # available without a sensor, too
+    sensorless = dict[str, Any](availability=[{"topic": f"{root}/availability"}])  # available without a sensor, too
     config, button = dict[str, Any](entity_category="config"), dict[str, Any](platform="button", payload_press="{}")
     controls = {
         "set_soc": config
@@ -216,8 +216,8 @@ def _controls(root: str) -> dict[str, dict[str, Any]]:
             "unit_of_measurement": "%",
         },
         "current_zero": config | button | {"name": "Take present current as zero"},
-        "acknowledge_alarm": service | button | {"name": "Acknowledge alarms"},
-        "publish_rate": service
+        "acknowledge_alarm": sensorless | button | {"name": "Acknowledge alarms"},
+        "publish_rate": sensorless
         | config
         | {
             "platform": "number",
@@ -231,6 +231,6 @@ def _controls(root: str) -> dict[str, dict[str, Any]]:
             "mode": "box",
             "unit_of_measurement": "Hz",
         },
-        "forget_pack": service | config | button | {"name": "Forget pack", "enabled_by_default": False},
+        "forget_pack": sensorless | config | button | {"name": "Forget pack", "enabled_by_default": False},
     }
     return {name: {"command_topic": f"{root}/request/{name}"} | control for name, control in controls.items()}

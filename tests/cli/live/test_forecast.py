@@ -177,7 +177,7 @@ def test_invalid_arguments_are_reported(
 
 
 def test_missing_checkpoint_is_reported(capsys: pytest.CaptureFixture[str], pack: Path, tmp_path: Path) -> None:
-    other = tmp_path / "pack.toml"
+    other = tmp_path / "pack.toml"  # names the state folder of ``pack``, which contains no checkpoint of this cell
     other.write_text(pack.read_text().replace("ncr18650", "chen_mora"))
     code, _, err = run(capsys, "forecast", other, "--power-w", 5)
     assert code == 2

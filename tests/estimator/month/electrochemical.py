@@ -126,7 +126,7 @@ class ElectrochemicalCell:
         return np.concatenate([truth, self.solve(taper)])
 
     def solve(self, step: object) -> np.ndarray:
-        """Solve a step, and return its true values without the last, whose time is that of the next step's first."""
+        """Solve a step, and return its true values without the last one, because the next step begins at its time."""
         experiment = self.pybamm.Experiment([step])
         simulation = self.pybamm.Simulation(
             self.model, experiment=experiment, parameter_values=self.values, solver=self.solver

@@ -41,7 +41,9 @@ async def test_batches_over_mqtt_and_nats_become_blocks(fleet: Tenant, tmp_path:
         report = await anext(mqtt.messages)
         await mqtt.publish("telemetry/p1", arrow_batch(rows[6:]), qos=1)
         await sender.jetstream().publish("telemetry.p2", json_batch(rows[6:]))
-        received = {message.subject: decode(message.data) for message in [await blocks.next_msg(LONG_S) for _ in "12"]}
+        received = {
+            message.subject: decode(message.data) for message in [await blocks.next_msg(LONG_S) for _ in range(2)]
+        }
         assert await ingest.end() == 0
     assert b"neither JSON nor Arrow IPC" in bytes(report.payload)
     assert set(received) == {"raw.p1", "raw.p2"}

@@ -7,7 +7,7 @@ from bms_estimator.process.tasks import end
 
 
 class Messages:
-    """Messages of one partition, without end or of a given number."""
+    """Messages of one partition: ``number`` of them, or an endless sequence."""
 
     def __init__(self, order: list["Messages"], number: int | None = None) -> None:
         self._order, self._number = order, number

@@ -198,7 +198,7 @@ async def test_arrival_time_is_the_same_whether_a_message_is_delivered_or_read_f
 async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_hours(
     nc, cluster, heartbeats, tmp_path
 ):
-    """Send blocks before the worker starts, which it reads from the stream, and after that, which it gets delivered."""
+    """The worker reads the blocks sent before its start from the stream, and receives the later ones."""
     await load_packs(nc, ["p1", "p2"])
 
     stores_s = {"p1": YEAR_2040_S, "p2": int(time.time()) - 86_400}

@@ -77,7 +77,7 @@ def test_row_has_the_estimates_at_the_end_of_the_hour(hour):
     assert abs(summary.soc_offset_correlation) <= 1.0
 
 
-def test_the_margin_is_the_minimum_over_samples_with_valid_parameters_of_the_capacitances() -> None:
+def test_margin_is_the_minimum_over_samples_with_a_valid_margin() -> None:
     samples, _ = pulses()
     estimator, other = (
         Estimator(file_with_ladder(0.1), identifier=IdentifierSettings(), initial_soc=1.0) for _ in range(2)

@@ -47,7 +47,7 @@ def steady_state():
 
 
 def test_x2_and_x3_of_the_observer_have_the_ratio_of_the_time_constants(steady_state):
-    """Erratum 15: those of the cell have the ratio of the resistances.
+    """Erratum 15: x2 and x3 of the cell have the ratio of the resistances.
 
     The time constants are 32.8 s and 223 s, the resistances 46.7 and 49.8 mohm.
     """

@@ -105,7 +105,7 @@ def _with_devices(devices: Sequence[str], header: Sequence[str]) -> Sequence[str
     """Return column names with the names of the devices in the line above, if it has any."""
     if len(devices) != len(header) or not any(map(_DEVICE.fullmatch, devices)):
         return header
-    # above the time column, whose name is a time zone, VRM writes ``timestamp``, which replaces this name
+    # VRM names the time column by a time zone and writes ``timestamp`` above it, which replaces the name
     return [
         f"{device} {name}" if _DEVICE.fullmatch(device) else device or name
         for device, name in zip(devices, header, strict=True)

@@ -13,8 +13,8 @@ from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit, find_u
 FIRST_UNIX_S, LAST_UNIX_S = 9e8, 4e9
 """Range of Unix times in a capture: 1998 to 2096 [s]."""
 MIN_BETTER_FRACTION = 0.1
-"""Minimum difference at which the second time column is chosen: fraction of disordered times of the first one (times that are not
-later than all before them), minus that of the second one."""
+"""Minimum decrease of the fraction of disordered times at which the second time column is chosen instead of the first one. A
+disordered time is not later than all times before it."""
 MAX_RATE_ERROR = 0.2
 """Maximum relative difference of the rates of two time columns that agree."""
 DAY_S = 86_400.0
