@@ -342,6 +342,35 @@ async def test_a_new_pack_beside_a_running_one_with_an_alarm_raises_none(folder:
     assert all(second.relay)
 
 
+def settings_on(name: str, tables: dict[str, Any]) -> Settings:
+    """Return ``SETTINGS`` of a pack with this name, and with these tables."""
+    base = SETTINGS.model_dump(by_alias=True, exclude_unset=True)
+    return Settings.model_validate(base | tables | {"pack": base["pack"] | tables.get("pack", {}) | {"name": name}})
+
+
+BY_ID, TOPIC = "/dev/serial/by-id/usb-1a86_", {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-1"}
+
+
+@pytest.mark.parametrize(
+    ("former", "later", "is_raised"),
+    [
+        ({"sensor": {"port": BY_ID + "1"}}, {"sensor": {"port": BY_ID + "2"}}, False),
+        ({"source": TOPIC}, {"source": TOPIC | {"prefix": "jk-2"}}, False),
+        ({"sensor": {"port": "/dev/ttyUSB0"}}, {"sensor": {"port": "/dev/ttyUSB1"}, "pack": {"series": 16}}, False),
+        ({"sensor": {"port": "/dev/ttyUSB0"}}, {"sensor": {"port": "/dev/ttyUSB1"}}, True),
+        ({"sensor": {"port": BY_ID + "1"}}, {"sensor": {"port": BY_ID + "1"}, "pack": {"series": 16}}, True),
+        ({"sensor": {"port": BY_ID + "1"}}, {"source": TOPIC}, True),
+    ],
+)
+def test_only_a_pack_that_is_surely_another_one_starts_beside_an_alarm_without_one(
+    folder: Path, former: dict[str, Any], later: dict[str, Any], *, is_raised: bool
+) -> None:
+    """On another device of the same kind, or with other cells and another device, it is another pack."""
+    file = StateFiles(folder, settings_on("pack", former), CELL).run_file
+    file.save(file.load().counters)
+    assert bool(StateFiles(folder, settings_on("new", later), CELL).run_file.load().lost_reason) == is_raised
+
+
 async def test_an_alarm_that_is_disabled_while_it_is_raised_needs_an_acknowledgement(folder: Path) -> None:
     disabled = edit_settings("alarms", pack_over_voltage={"enabled": False})
     restarted = await run(folder, NORMAL, disabled)
