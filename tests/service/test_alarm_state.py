@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import structlog
 
 from bms_estimator.checkpoint.run_file import RunCounters, add_checksum
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
@@ -369,6 +370,16 @@ def test_only_a_pack_that_is_surely_another_one_starts_beside_an_alarm_without_o
     file = StateFiles(folder, settings_on("pack", former), CELL).run_file
     file.save(file.load().counters)
     assert bool(StateFiles(folder, settings_on("new", later), CELL).run_file.load().lost_reason) == is_raised
+
+
+async def test_settings_that_the_first_values_contradict_are_logged_once(tmp_path: Path) -> None:
+    with structlog.testing.capture_logs() as lines:
+        async with running(StateFiles(tmp_path, SETTINGS, CELL)) as (source, sink):
+            for time_s in range(3):
+                source.give_block(np.array([(time_s, 0.0, 4.4, 25.0, 25.0, 25.0, 0)], SAMPLE), capacity_ah=280.0)
+            await sink.until(lambda s: s.estimate is not None)
+    reasons = [line["reason"] for line in lines if line["event"] == "implausible setting"]
+    assert [reason.partition(" ")[0] for reason in reasons] == ["pack.capacity_ah:", "pack.series"]
 
 
 async def test_an_alarm_that_is_disabled_while_it_is_raised_needs_an_acknowledgement(folder: Path) -> None:
