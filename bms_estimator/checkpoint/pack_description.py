@@ -30,16 +30,15 @@ class PackDescription(NamedTuple):
 
         No device may be the same. Besides, either the cells must differ, or the devices must have addresses of one
         kind that are their own: topic, Bluetooth address, host, or serial number of a USB adapter. A device that is
-        reached in another way may be the same one, and ports such as /dev/ttyUSB0 are renumbered.
+        reached in another way may be the same one, and ports such as /dev/ttyUSB0 are renumbered. A topic or host that
+        was renamed together with the pack counts as another device.
 
         Args:
             devices: Saved devices, as JSON; None: unknown.
             cells: Saved cells.
         """
-        if not isinstance(devices, list) or not devices or not self.devices:
-            return False
-        saved = [tuple(each) for each in devices]
-        if set(saved) & set(self.devices):
+        saved = [tuple(each) for each in devices] if isinstance(devices, list) else []
+        if not saved or not self.devices or set(saved) & set(self.devices):
             return False
         return cells != self.cells or saved[0][0] == self.devices[0][0] != ""
 

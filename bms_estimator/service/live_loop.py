@@ -246,10 +246,10 @@ async def _estimate(
     """
     logged_reason, before_s, checked_ah = "", restored_s, None
     async for each in source:
-        device_ah, last = each.device_capacity_ah, each.samples[-1:]
+        device_ah = each.device_capacity_ah
         if checked_ah is None or (math.isnan(checked_ah) and not math.isnan(device_ah)):
             checked_ah = device_ah
-            for voltage_v, current_a in last[["voltage_v", "current_a"]].tolist():
+            for voltage_v, current_a in each.samples[-1:][["voltage_v", "current_a"]].tolist():
                 for text in implausible_measurement(model, voltage_v, current_a, device_ah):
                     log.warning("implausible setting", reason=text)
         received = each._replace(cells_v=slots.select(each.cells_v))
