@@ -39,9 +39,9 @@ class ScriptedSource:
         padded = [row if len(row) == 5 else (*row, np.nan, 0) for row in rows]
         self.give_block(np.array([(*row[:4], row[3], row[3], row[4]) for row in padded], dtype=SAMPLE))
 
-    def give_block(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS) -> None:
-        """Add a block of samples with their cell voltages."""
-        self._queue.put_nowait(ReceivedSamples(samples, cells_v))
+    def give_block(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS, capacity_ah: float = np.nan) -> None:
+        """Add a block of samples with their cell voltages, and the capacity that the device reports."""
+        self._queue.put_nowait(ReceivedSamples(samples, cells_v, device_capacity_ah=capacity_ah))
 
     def finish(self) -> None:
         self._queue.put_nowait(None)

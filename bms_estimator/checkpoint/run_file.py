@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeGuard
 import numpy as np
 import structlog
 
+from bms_estimator.checkpoint.pack_description import PackDescription
 from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.instance_lock import is_locked
 from bms_estimator.process.private_file import overwrite_private, read_private, write_private
@@ -98,10 +99,13 @@ class RunFile:
         folder: Folder of the file.
         name: Name of the pack.
         wall_s: Wall clock [s since 1970].
+        pack: Devices and cells of the pack; None: unknown.
     """
 
-    def __init__(self, folder: Path, name: str, wall_s: Callable[[], float]) -> None:
-        self._name, self._wall_s = name, wall_s
+    def __init__(
+        self, folder: Path, name: str, wall_s: Callable[[], float], pack: PackDescription | None = None
+    ) -> None:
+        self._name, self._wall_s, self._pack = name, wall_s, pack or PackDescription()
         self.path = folder / f"{name}.run"
         self._quarantined = folder / f"{name}.refused.run"
 
@@ -112,6 +116,7 @@ class RunFile:
             OSError: The file cannot be written.
         """
         values = {"format": FORMAT, "name": self._name, **vars(counters), "total": counters.total.model_dump()}
+        values |= self._pack._asdict()
         content = add_checksum(json.dumps(values).encode())
         try:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -187,20 +192,26 @@ class RunFile:
     def _other_pack_with_alarm(self) -> str:
         """Return a reason if another pack, which this one may be after a renaming, has a critical alarm or a lost sensor.
 
-        A pack that is served at present has not been renamed.
+        A pack that a service runs at present was not renamed. Neither was a pack whose settings describe another one
+        (``PackDescription.differs``): it is only logged, because a new pack would otherwise start with an alarm. A file
+        of a former version, which lacks the description, counts as renamed, so that a latched alarm is not lost.
         """
         folder = self.path.parent
         for path in self._folder_content():
             if path.suffix == ".run" and not path.name.endswith(".refused.run") and not is_locked(folder, path.stem):
                 with contextlib.suppress(Exception):  # a damaged file concerns the other pack
-                    alarms = json.loads(_read(path)["alarms"] or "{}")
+                    values = _read(path)
+                    alarms = json.loads(values["alarms"] or "{}")
                     inputs = alarms.pop("inputs", {}).values()
                     if (
                         alarms.get("pending")
                         or any(lost for _, lost in inputs)
                         or '"severity": "critical"' in json.dumps(alarms)
                     ):
-                        return f"{path.stem} has an alarm in {path.name}, and this pack may be {path.stem}, renamed"
+                        reason = f"{path.stem} has an alarm in {path.name}, and this pack may be {path.stem}, renamed"
+                        if not self._pack.differs(values.get("devices"), values.get("cells")):
+                            return reason
+                        log.warning("another pack in the state folder was stopped with an alarm", pack=path.stem)
         return ""
 
     def _folder_content(self) -> list[Path]:

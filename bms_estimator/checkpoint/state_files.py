@@ -33,6 +33,7 @@ from bms_estimator.checkpoint.arrays_file import (
     write_arrays,
 )
 from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, BaseCheckpoint, ChangesFile
+from bms_estimator.checkpoint.pack_description import PackDescription
 from bms_estimator.checkpoint.run_file import RunFile, SavedRun
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import CellModel, with_capacity
@@ -258,7 +259,7 @@ class StateFiles:
         self.checkpoint = CheckpointFile(folder, settings, model, now)
         self.history = ArraysFile(folder, settings, model, HISTORY_SUFFIX)
         self.load = ArraysFile(folder, settings, model, LOAD_SUFFIX)
-        self.run_file = RunFile(folder, settings.pack.name, lambda: now().wall_s)
+        self.run_file = RunFile(folder, settings.pack.name, lambda: now().wall_s, PackDescription.of(settings))
         self.thread = DaemonThreadExecutor("checkpoint")
 
     def newest(self) -> "StateFiles":

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
+from bms_estimator.estimator.settings_plausibility import implausible_measurement
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.protocols.registry import make_protocol
@@ -58,6 +59,8 @@ class FirstSample:
     """Properties that the device reported; empty without any."""
     cells: int
     """Number of cell voltages; 0 without any."""
+    capacity_ah: float = math.nan
+    """Capacity that the device reported [Ah]; NaN without one."""
 
     def __str__(self) -> str:
         """Describe the sample and the device."""
@@ -101,6 +104,8 @@ def check_device(subject: ExaminedPack) -> Iterator[Finding]:
         yield fault(NAME, str(error), silence_remedy(subject))
         return
     yield ok(NAME, f"{name}: {sample}")
+    for text in implausible_measurement(subject.model, sample.voltage_v, sample.current_a, sample.capacity_ah):
+        yield warning(NAME, text, f"edit {subject.path}, then: bms-estimator config check {subject.path}")
     series = subject.model.cell.series_count
     if sample.cells != series and (sample.cells or subject.settings.bms):
         text = f"{sample.cells} cells are measured, but the pack has {series} in series"
@@ -143,7 +148,9 @@ async def _first_sample(subject: ExaminedPack) -> FirstSample:
                     if sample is None:
                         sample = FirstSample(float(last["voltage_v"]), float(last["current_a"]), dict(source.board), 0)
                         limit.reschedule(asyncio.get_running_loop().time() + CELLS_TIMEOUT_S)
-                    sample = replace(sample, cells=max(sample.cells, int(cells)))
+                    sample = replace(
+                        sample, cells=max(sample.cells, int(cells)), capacity_ah=received.device_capacity_ah
+                    )
                     if sample.cells == series or sample.board.get("bandgap_v"):  # a board measures no cells
                         break
         if sample is None:

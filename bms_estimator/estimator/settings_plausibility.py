@@ -35,6 +35,21 @@ MAX_SINGLE_ROW = 8
 MAX_LOAD_CUTOFF_SOC = 0.5
 """Maximum plausible SOC of the OCV curve at the cut-off voltage of the load. Inverters of LFP packs switch off at up to 3.2 V per
 cell, at which the OCV curve of the generic cell has 0.11."""
+CAPACITY_TOLERANCE = 0.2
+"""Maximum relative deviation from the capacity that the device reports. A worn pack may have a fifth less than rated."""
+MAX_RESTING_C = 0.05
+"""Current relative to the capacity [1/h]. Up to it, the voltage is within ``RESTING_V`` of the OCV."""
+RESTING_SOC = 0.02, 0.98
+"""SOC between which the OCV is compared. Beyond, the curve is steep, and cells leave it soon after a charge or discharge."""
+RESTING_V = 0.05
+"""Maximum deviation of a resting cell from the OCV [V]: error of a voltage sensor, and relaxation."""
+BELOW_EMPTY_V, ABOVE_FULL_V = 0.5, 0.3
+"""Margins below the OCV at SOC 0, for a load, and above the OCV at SOC 1, for a charger [V]. Both include differences
+between manufacturers."""
+LFP_PLATEAU_V = 3.2, 3.36
+"""Voltage of a resting LFP cell between SOC 0.15 and 0.95 [V]. Other cells with an OCV above ``MIN_OTHER_V`` are nearly empty there."""
+MIN_OTHER_V = 3.5
+"""Lowest OCV at SOC 0.5 of cells that are not LFP or LTO [V]."""
 CONVERTER_STEPS = 1024
 """Number of steps of the firmware's voltage converter."""
 
@@ -51,6 +66,41 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
     """
     lines = cell.by_kind(lambda battery: _battery_lines(settings, battery), lambda stack: _stack_lines(settings, stack))
     return [line for line in lines if line]
+
+
+def implausible_measurement(cell: PackModel, voltage_v: float, current_a: float, device_ah: float) -> list[str]:
+    """Return one line for each setting of a battery that the first values of its device contradict.
+
+    Args:
+        cell: Model of the whole pack.
+        voltage_v: Voltage of the pack [V]; NaN: unknown.
+        current_a: Current [A]; NaN: unknown.
+        device_ah: Capacity that the device reports [Ah]; NaN: unknown.
+    """
+    return cell.by_kind(
+        lambda battery: list(_contradictions(battery, voltage_v, current_a, device_ah)), lambda _: list[str]()
+    )
+
+
+def _contradictions(cell: CellModel, voltage_v: float, current_a: float, device_ah: float) -> Iterator[str]:
+    capacity_ah, series = cell.cell.capacity_ah, cell.cell.series_count
+    if abs(device_ah - capacity_ah) > CAPACITY_TOLERANCE * max(device_ah, capacity_ah):
+        yield f"pack.capacity_ah: the pack has {capacity_ah:g} Ah, but its device reports {device_ah:g} Ah"
+    ocv_v = ocv_grid(cell)[0] / series
+    low_v, mid_v, high_v = np.interp((RESTING_SOC[0], 0.5, RESTING_SOC[1]), np.linspace(0.0, 1.0, ocv_v.size), ocv_v)
+    rests, cell_v = abs(current_a) <= MAX_RESTING_C * capacity_ah, voltage_v / series
+    if rests:
+        low_v, high_v = low_v - RESTING_V, high_v + RESTING_V
+    else:
+        low_v, high_v = ocv_v[0] - BELOW_EMPTY_V, ocv_v[-1] + ABOVE_FULL_V
+    if not low_v <= cell_v <= high_v and voltage_v > 0.0:
+        state = "at rest, unless they were just charged or are empty" if rests else "under load or charge"
+        yield (
+            f"pack.series = {series}: {voltage_v:.2f} V are {cell_v:.2f} V a cell, but {cell.cell.name} has {low_v:.2f} to "
+            f"{high_v:.2f} V {state}; {round(voltage_v / mid_v)} in series is likely, or another pack.cell"
+        )
+    elif rests and mid_v >= MIN_OTHER_V and LFP_PLATEAU_V[0] <= cell_v <= LFP_PLATEAU_V[1]:
+        yield f"pack.cell: {cell_v:.2f} V a cell is what LFP has at rest, and {cell.cell.name} is nearly empty there"
 
 
 def _battery_lines(settings: Settings, cell: CellModel) -> Iterator[str | None]:

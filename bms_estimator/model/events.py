@@ -13,6 +13,8 @@ from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 
 MIN_UNSEEN_S = 1.0
 """Minimum duration of a gap that causes an event [s]. Shorter gaps only count in ``health``."""
+MAX_NAMES = 4
+"""Maximum number of alarms that an event names, so that the reason after them is seen."""
 NOT_SAVED = ("cannot be saved", "not saved")
 """Prefixes of ``health.checkpoint`` that report a failed checkpoint."""
 
@@ -112,7 +114,9 @@ def watch_events(alarms: Iterable[Alarm]) -> Iterator[EventText]:
     for alarm in alarms:
         names[alarm.unwatched_reason].append(alarm.name)
     for reason, group in names.items():
-        text = ", ".join(group) if len(group) == 1 else f"{len(group)} alarms ({', '.join(group)})"
+        rest = f" and {len(group) - MAX_NAMES} more" if len(group) > MAX_NAMES else ""
+        listed = ", ".join(group[:MAX_NAMES]) + rest
+        text = listed if len(group) == 1 else f"{len(group)} alarms ({listed})"
         yield EventText("alarm_watched", text) if reason is None else EventText("alarm_unwatched", f"{text}: {reason}")
 
 

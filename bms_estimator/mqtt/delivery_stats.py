@@ -19,7 +19,7 @@ class DeliveryStats:
     losses: int = 0
     """Number of lost connections."""
     trouble: str | None = None
-    """Reason for the last lost or failed connection."""
+    """Reason for the lost or failed connection; None while connected, and before the first attempt."""
     refused_topics: list[str] = field(default_factory=list)
     """Topics that the broker denies, as far as it reports denials."""
     corrections: int = 0

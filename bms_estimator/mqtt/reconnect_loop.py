@@ -75,6 +75,7 @@ class ReconnectLoop:
                 connected_at_s = loop.time()
                 log.info("broker connected", url=broker.url, protocol=connection.protocol)
                 self._logged.clear()
+                self._delivery.trouble = None
                 await self._serve(connection)
         except* BrokerConnectionError as errors:
             self._delivery.losses += connected_at_s is not None

@@ -105,7 +105,7 @@ class Subscriber:
 
     @property
     def trouble(self) -> str | None:
-        """Reason for the last lost or failed connection; None if there was none."""
+        """Reason for the lost or failed connection; None while connected."""
         return self._delivery.trouble
 
     async def __aenter__(self) -> Self:

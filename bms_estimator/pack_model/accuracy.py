@@ -49,6 +49,11 @@ LOW_SOC = 0.1
 """Proposed lower end of discharge [SOC]."""
 MEASURED_FRACTION = 0.8
 """Maximum std of a measured curve, as a fraction of the present std, for which its measurement is proposed."""
+EQUIPMENT = "a measured OCV curve", "a temperature sensor"
+"""Changes that need equipment or a test. The other ones are only another use of the pack."""
+SIMILAR = 1.25
+"""Maximum ratio to the lowest std at which another use of the pack is proposed before ``EQUIPMENT``. The assumptions about
+curve and use are hardly more accurate."""
 SOC, LN_Q, HYSTERESIS, CURVE = 0, 1, 2, 3
 """Positions of the unknowns; the curve's errors are the last ones."""
 
@@ -191,15 +196,17 @@ def with_soc_bound(fitted: PackFit, cell: CellCurves, rows: NDArray[np.void], ha
 
 
 def improvements(cell: CellCurves, window: Window) -> dict[str, float]:
-    """Return the lower bound of the std in the present window after each possible change, the lowest first.
+    """Return the lower bound of the std in the present window after each possible change, the best change first.
 
+    The best change has the lowest std, unless another use of the pack, which costs nothing, comes near (``SIMILAR``).
     Changes that are already in force are omitted.
     """
     stds = {
         name: float(Accuracy(changed_cell, changed).std(window.soc).mean())
         for name, changed_cell, changed in _changes(cell, window)
     }
-    return dict(sorted(stds.items(), key=lambda item: item[1]))
+    max_std = SIMILAR * min(stds.values(), default=0.0)
+    return dict(sorted(stds.items(), key=lambda item: (item[0] in EQUIPMENT or item[1] > max_std, item[1])))
 
 
 def _changes(cell: CellCurves, window: Window) -> Iterator[tuple[str, CellCurves, Window]]:

@@ -112,7 +112,9 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
         ("voltage", "current"),
         "V",
     ),
-    "link_lost": AlarmKind("no samples arrive", "check the device, its power and its connection", unit="s"),
+    "link_lost": AlarmKind(
+        "no samples arrive", "check the device, its power, its connection and, for MQTT, the broker", unit="s"
+    ),
     "hook_failed": AlarmKind(
         "the last run of an alarm hook failed", "check the hook, and do by hand what it should have done"
     ),

@@ -97,4 +97,6 @@ class Answers:
         if self.sensor:
             tables["sensor"] = {**tables.get("sensor", {}), **dict(self.sensor)}
         tables["page"] = {"listen": DEFAULT_LISTEN}
-        return tables | ({"mqtt": dict(brokers["mqtt"])} if "mqtt" in brokers else {})
+        # without a login, every client of the broker could acknowledge a critical alarm, after which a relay closes
+        commands = {"commands": ["acknowledge_alarm"]} if self.broker and self.broker.username else {}
+        return tables | ({"mqtt": {**brokers["mqtt"], **commands}} if "mqtt" in brokers else {})

@@ -5,6 +5,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from bms_estimator.estimator.settings_plausibility import implausible_measurement
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.config_file import parse_toml
 from bms_estimator.model.errors import UserError
@@ -13,9 +14,6 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.pack_file import create_pack_file
 from bms_estimator.settings.settings_template import settings_file
 from bms_estimator.setup.answers import Answers
-
-CAPACITY_TOLERANCE = 0.2
-"""Maximum relative deviation from the capacity that the device reports. A worn pack may have a fifth less than rated."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +47,9 @@ def create_pack(file: Path, answers: Answers) -> NewPack:
     pack = settings.pack
     cell = load_cell(pack.cell, pack.capacity_ah).pack(pack.series, pack.parallel)
     warnings = check_settings(settings, cell)
-    capacity_ah, device_ah = cell.cell.capacity_ah, answers.device_capacity_ah
-    if device_ah and not math.isclose(capacity_ah, device_ah, rel_tol=CAPACITY_TOLERANCE):
-        warnings.append(f"pack.capacity_ah: the pack has {capacity_ah:g} Ah, but its device reports {device_ah:g} Ah")
+    measured = answers.measured
+    values = (measured.voltage_v, measured.current_a) if measured else (math.nan, math.nan)
+    warnings += implausible_measurement(cell, *values, answers.device_capacity_ah or math.nan)
     create_pack_file(file, answers.tables)
     logins = {answers.password_file(key): each for key, each in answers.logins.items() if each.password is not None}
     password_files = {file.with_name(name): login for name, login in logins.items()}

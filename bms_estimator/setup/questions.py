@@ -11,7 +11,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from bms_estimator.estimator.settings_plausibility import MAX_CAPACITY_AH
+from bms_estimator.estimator.settings_plausibility import ABOVE_FULL_V, BELOW_EMPTY_V, MAX_CAPACITY_AH
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.model.cell import generic_cells, load_cell, shipped_cells
 from bms_estimator.model.config_file import error_reason, without_secrets
@@ -19,9 +19,6 @@ from bms_estimator.settings.pack import DEVICE_NAME, PackSettings
 from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
 from bms_estimator.setup.broker_login import ADDRESS_FORM, BrokerLogin
 
-BELOW_EMPTY_V, ABOVE_FULL_V = 0.5, 0.3
-"""Margins below the OCV at SOC 0, for a load, and above the OCV at SOC 1, for a charger [V]. Both include differences
-between manufacturers."""
 COMMON_COUNTS = (1, 2, 3, 4, 6, 7, 8, 10, 12, 13, 14, 15, 16, 20, 24)
 """Numbers of cells in series of common packs."""
 

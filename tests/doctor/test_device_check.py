@@ -75,8 +75,11 @@ def test_another_number_of_cells_than_in_series_is_a_warning(tmp_path: Path, mon
     monkeypatch.setattr(device_check, "CELLS_TIMEOUT_S", 0.1)
     bms = SimulatedBms("jk", lambda _: Reading(current_a=5.0, voltage_v=16.5, temperature_c=25.0), cells=5)
     with running_device(bms) as port:
-        device, cells = check_device(subject(tmp_path, sensor={"port": port, "protocol": "jk"}))
+        device, capacity, series, cells = check_device(subject(tmp_path, sensor={"port": port, "protocol": "jk"}))
     assert device.level is Level.OK
+    assert capacity.text == "pack.capacity_ah: the pack has 20 Ah, but its device reports 100 Ah"
+    assert series.text.startswith("pack.series = 4: 16.50 V are 4.12 V a cell")
+    assert "5 in series is likely" in series.text
     assert (cells.level, cells.text) == (Level.WARNING, "5 cells are measured, but the pack has 4 in series")
 
 

@@ -3,10 +3,14 @@
 import itertools
 from typing import Any
 
-from bms_estimator.model.events import events
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.events import events, watch_events
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.health import AnchorReport
 from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.settings.alarm_limits import monitored_alarms
+from bms_estimator.settings.pack import Settings
+from bms_estimator.telemetry.alarms.message import AlarmMessage, alarm_payload
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 AT_41_C = f"no data at 41 C, the cell file knows 25 C: {InputFault.TEMPERATURE.text}"
@@ -31,6 +35,14 @@ def with_gap_total(seconds: float) -> Snapshot:
 def test_a_start_event_contains_the_outcome_of_the_checkpoint():
     start, *_ = events(None, with_health(checkpoint="restored: SOC 0.5"))
     assert (start.name, start.text) == ("start", "checkpoint: restored: SOC 0.5")
+
+
+def test_an_event_names_the_first_alarms_of_many() -> None:
+    kinds = monitored_alarms(Settings(), load_cell("ncr18650"))[:6]
+    message = AlarmMessage(None, cause_cleared=False, reasons=(), unwatched_reason="no board", unknown_reason=None)
+    names = [kind.name for kind in kinds]
+    (event,) = watch_events(alarm_payload(kind, message) for kind in kinds)
+    assert event.text == f"6 alarms ({', '.join(names[:4])} and 2 more): no board"
 
 
 def test_a_start_without_a_sensor_causes_no_offline_event():

@@ -107,6 +107,7 @@ async def test_subscriber_reconnects_to_a_restarted_broker(broker: Broker) -> No
         broker.start()
         await watched.until(lambda: len(watched.lost_since_changes) == 3)
         assert watched.subscriber.lost_since is None
+        assert watched.subscriber.trouble is None
         async with Listener(broker) as client:
             await client.publish("bms/pack/state", b"2", qos=1)
         await watched.until(lambda: watched.stored("pack", "state") == 2)

@@ -95,6 +95,15 @@ def test_each_change_lowers_the_std_of_an_lfp_pack_that_is_never_full() -> None:
     assert max(stds.values()) < present
 
 
+@pytest.mark.parametrize(
+    ("name", "low", "best"), [("lfp", 0.2, "a full charge each week"), ("nmc", 0.2, "a measured OCV curve")]
+)
+def test_a_change_that_costs_nothing_is_first_only_if_it_helps_about_as_much(name: str, low: float, best: str) -> None:
+    stds = improvements(curves(name), Window(low, 0.8))
+    assert next(iter(stds)) == best
+    assert min(stds, key=lambda change: stds[change]) == "a measured OCV curve"
+
+
 def test_a_fit_carries_the_bound_and_the_best_change_of_the_use_since_the_last_exchange() -> None:
     cell, rows = curves("lfp"), np.zeros(40, HISTORY_ROW)
     rows["segment"], rows["soc"], rows["current_a"] = np.arange(40) // 20, np.linspace(0.5, 0.9, 40), 1.0

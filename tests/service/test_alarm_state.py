@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import structlog
 
 from bms_estimator.checkpoint.run_file import RunCounters, add_checksum
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
@@ -340,6 +341,45 @@ async def test_a_new_pack_beside_a_running_one_with_an_alarm_raises_none(folder:
         second = await run(folder, NORMAL, edit_settings("pack", name="second"))
     assert not second.alarms["alarm_state_lost"].active
     assert all(second.relay)
+
+
+def settings_on(name: str, tables: dict[str, Any]) -> Settings:
+    """Return ``SETTINGS`` of a pack with this name, and with these tables."""
+    base = SETTINGS.model_dump(by_alias=True, exclude_unset=True)
+    return Settings.model_validate(base | tables | {"pack": base["pack"] | tables.get("pack", {}) | {"name": name}})
+
+
+BY_ID, TOPIC = "/dev/serial/by-id/usb-1a86_", {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-1"}
+
+
+@pytest.mark.parametrize(
+    ("former", "later", "is_raised"),
+    [
+        ({"sensor": {"port": BY_ID + "1"}}, {"sensor": {"port": BY_ID + "2"}}, False),
+        ({"source": TOPIC}, {"source": TOPIC | {"prefix": "jk-2"}}, False),
+        ({"sensor": {"port": "/dev/ttyUSB0"}}, {"sensor": {"port": "/dev/ttyUSB1"}, "pack": {"series": 16}}, False),
+        ({"sensor": {"port": "/dev/ttyUSB0"}}, {"sensor": {"port": "/dev/ttyUSB1"}}, True),
+        ({"sensor": {"port": BY_ID + "1"}}, {"sensor": {"port": BY_ID + "1"}, "pack": {"series": 16}}, True),
+        ({"sensor": {"port": BY_ID + "1"}}, {"source": TOPIC}, True),
+    ],
+)
+def test_only_a_pack_that_is_surely_another_one_starts_beside_an_alarm_without_one(
+    folder: Path, former: dict[str, Any], later: dict[str, Any], *, is_raised: bool
+) -> None:
+    """On another device of the same kind, or with other cells and another device, it is another pack."""
+    file = StateFiles(folder, settings_on("pack", former), CELL).run_file
+    file.save(file.load().counters)
+    assert bool(StateFiles(folder, settings_on("new", later), CELL).run_file.load().lost_reason) == is_raised
+
+
+async def test_settings_that_the_first_values_contradict_are_logged_once(tmp_path: Path) -> None:
+    with structlog.testing.capture_logs() as lines:
+        async with running(StateFiles(tmp_path, SETTINGS, CELL)) as (source, sink):
+            for time_s in range(3):
+                source.give_block(np.array([(time_s, 0.0, 4.4, 25.0, 25.0, 25.0, 0)], SAMPLE), capacity_ah=280.0)
+            await sink.until(lambda s: s.estimate is not None)
+    reasons = [line["reason"] for line in lines if line["event"] == "implausible setting"]
+    assert [reason.partition(" ")[0] for reason in reasons] == ["pack.capacity_ah:", "pack.series"]
 
 
 async def test_an_alarm_that_is_disabled_while_it_is_raised_needs_an_acknowledgement(folder: Path) -> None:

@@ -175,7 +175,7 @@ async def test_the_next_broker_is_tried_and_the_unreachable_one_is_named(broker:
                 break
     reasons = [line["reason"] for line in lines if line["event"] == "no samples"]
     assert len(reasons) == 1
-    assert reasons[0].startswith(f"esphome-jk jk-bms by MQTT, {unreachable}: ")
+    assert reasons[0].startswith(f"esphome-jk jk-bms by MQTT, {unreachable}: no connection to this broker: ")
     assert reasons[0].endswith("; trying again")
 
 

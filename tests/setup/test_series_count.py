@@ -1,7 +1,11 @@
 """Number of cells in series from voltage and chemistry."""
 
+import math
+
 import pytest
 
+from bms_estimator.estimator.settings_plausibility import implausible_measurement
+from bms_estimator.model.cell import load_cell
 from bms_estimator.setup.questions import cell_voltages, possible_counts, suggest_count
 
 
@@ -32,3 +36,27 @@ def test_possible_counts_end_where_a_cell_would_be_outside_its_voltages() -> Non
     counts = possible_counts(52.8, cell)
     assert 52.8 / counts.start <= cell.max_v < 52.8 / (counts.start - 1)
     assert 52.8 / (counts.stop - 1) >= cell.min_v > 52.8 / counts.stop
+
+
+@pytest.mark.parametrize(
+    ("cell", "series", "voltage_v", "current_a", "text"),
+    [
+        ("lfp", 16, 52.8, 0.0, ""),
+        ("lfp", 16, 54.0, 0.0, ""),
+        ("lfp", 16, 56.8, -50.0, ""),
+        ("lfp", 16, 44.8, 100.0, ""),
+        ("lfp", 15, 52.8, 0.0, "52.80 V are 3.52 V a cell"),
+        ("lfp", 15, 56.0, 0.0, "3.73 V a cell"),
+        ("lfp", 8, 52.8, 50.0, "16 in series is likely"),
+        ("nmc", 14, 46.2, 0.0, "3.30 V a cell is what LFP has at rest"),
+        ("nmc", 14, 46.2, 30.0, ""),
+        ("nmc", 14, 51.8, 0.0, ""),
+        ("lfp", 15, math.nan, math.nan, ""),
+    ],
+)
+def test_a_voltage_that_the_cells_cannot_have_is_reported(
+    cell: str, series: int, voltage_v: float, current_a: float, text: str
+) -> None:
+    lines = implausible_measurement(load_cell(cell, 100.0).pack(series, 1), voltage_v, current_a, math.nan)
+    assert len(lines) == bool(text)
+    assert text in "".join(lines)

@@ -132,4 +132,7 @@ def _print(result: AccuracyResult) -> None:
     print_table(["", "SOC"], [(name, f"{100.0 * std:.1f} %") for name, std in rows])
     best = next(iter(result.with_change), None)
     if best is not None and result.with_change[best] < result.best_std:
-        typer.echo(f"{best[0].upper()}{best[1:]} helps most.")
+        is_lowest = result.with_change[best] == min(result.with_change.values())
+        typer.echo(
+            f"{best[0].upper()}{best[1:]} {'helps most' if is_lowest else 'helps about as much as the best change, and costs nothing'}."
+        )

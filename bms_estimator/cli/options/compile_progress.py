@@ -18,7 +18,7 @@ BAR_WIDTH = 24
 COMPILE_TEXT = (
     "compiling the kernels; this takes a minute, or several on a small machine, and later starts use the cache"
 )
-"""Line on a stderr that is not a terminal."""
+"""Line before the compilation. The bar does not appear on each terminal."""
 COMPILE_LABEL = "compiling kernels"
 """Label of the bar."""
 
@@ -35,10 +35,10 @@ def new_bar(console: Console) -> Progress:
 
 
 def compile_ahead(report: Callable[[str], object] | None = None) -> None:
-    """Compile all kernels that are not in the cache. Show a bar with the number of kernels and the time left.
+    """Compile all kernels that are not in the cache. Announce it, and show a bar with the number of kernels and the time left.
 
     Args:
-        report: Called with ``COMPILE_TEXT`` if stderr is not a terminal; default: write to stderr.
+        report: Called with ``COMPILE_TEXT``; default: write to stderr.
 
     Raises:
         TemporaryError: The memory is not sufficient.
@@ -46,8 +46,7 @@ def compile_ahead(report: Callable[[str], object] | None = None) -> None:
     if is_compiled():
         return
     console = Console(stderr=True)
-    if not console.is_terminal:
-        (report or partial(typer.echo, err=True))(COMPILE_TEXT)
+    (report or partial(typer.echo, err=True))(COMPILE_TEXT)
     with new_bar(console) as bar:
         task = bar.add_task(COMPILE_LABEL, total=None)
 

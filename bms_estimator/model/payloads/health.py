@@ -101,7 +101,7 @@ class EdgeHealth(Payload):
     blocks_dropped: int = Field(
         description="blocks dropped since start because the store was full or they could not be read"
     )
-    trouble: str | None = Field(description="reason of the last lost or failed connection; null: none")
+    trouble: str | None = Field(description="reason of the lost or failed connection; null: connected, or none failed")
 
 
 class HookHealth(Payload):
@@ -173,7 +173,7 @@ class Health(Payload):
         description="lost broker connections since start"
     )
     broker_trouble: str | None = Field(
-        description="reason of the last lost or failed connection to a broker; null: none since start"
+        description="reason of the lost or failed connection to a broker; null: connected, or no attempt failed"
     )
     refused_topics: list[str] = Field(description="topics that the broker denies, as far as known; empty: none")
     availability_corrections: Annotated[int, Quantity(prometheus="counter")] = Field(

@@ -106,7 +106,7 @@ class MqttProducer(LineProducer):
                 async for line in self._lines(connection):
                     yield line
         except BrokerConnectionError as error:
-            raise SourceUnavailableError(str(error)) from None
+            raise SourceUnavailableError(f"no connection to this broker: {error}") from None
 
     async def _lines(self, connection: Connection) -> AsyncGenerator[bytes, None]:
         """Yield the lines of a connection; raises ``BrokerConnectionError`` when it is lost."""

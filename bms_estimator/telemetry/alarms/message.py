@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.alarm_limits import AlarmDefinition
+from bms_estimator.settings.alarms import AlarmName
 
 
 class RaisedAlarm(NamedTuple):
@@ -17,8 +18,10 @@ class RaisedAlarm(NamedTuple):
     """Value in the unit of the alarm; None if the alarm has no number."""
 
 
-LATCHED = "the cause is gone; acknowledge it to end it: "
+LATCHED = "the cause is gone; acknowledge it (request acknowledge_alarm if mqtt.commands lists it, or SIGUSR1 to the service) to end it: "
 """Prefix of the text of a latched alarm."""
+CAUSE_FIRST: tuple[AlarmName, ...] = ("sensor_fault", "link_lost")
+"""Alarms whose cause stands before their general text, which fits many causes and would hide it."""
 
 
 def alarm_text(alarm: AlarmDefinition, value: float | None, reasons: Sequence[str], *, cause_cleared: bool) -> str:
@@ -33,7 +36,8 @@ def alarm_text(alarm: AlarmDefinition, value: float | None, reasons: Sequence[st
     factor, unit = (100.0, " %") if alarm.kind.is_fraction else (1.0, f" {alarm.kind.unit}" if alarm.kind.unit else "")
     numbers = "" if value is None else f": {factor * value:.4g}{unit}, limit {factor * alarm.limit:.4g}{unit}"
     text = f"{alarm.kind.fault}{numbers}; {alarm.kind.remedy}"
-    return (LATCHED if cause_cleared else "") + "; ".join((text, *reasons))
+    texts = (*reasons, text) if alarm.name in CAUSE_FIRST else (text, *reasons)
+    return (LATCHED if cause_cleared else "") + "; ".join(texts)
 
 
 class Change(NamedTuple):

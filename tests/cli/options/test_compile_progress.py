@@ -56,3 +56,4 @@ def test_a_terminal_shows_the_number_of_kernels_that_are_compiled_and_the_time_l
         terminal.until(
             lambda: re.search(rf"{COMPILE_LABEL}: [1-9]\d* of \d+ .*\d:\d\d:\d\d", terminal.output) is not None
         )
+        assert COMPILE_TEXT in terminal.output

@@ -305,7 +305,8 @@ def check_settings_with_login(file: Path, broker: Broker) -> None:
     """Check that source and service use the broker with the password, which only its owner can read."""
     settings = tomllib.loads(file.read_text())
     assert settings["source"] == {"kind": "mqtt", "profile": "esphome-jk", "prefix": "jk-bms"}
-    assert settings["mqtt"] == {"url": broker.url, "username": "owner", "password_file": "house-mqtt.password"}
+    login = {"url": broker.url, "username": "owner", "password_file": "house-mqtt.password"}
+    assert settings["mqtt"] == login | {"commands": ["acknowledge_alarm"]}
     assert settings["pack"]["series"] == 16
     password = file.with_name("house-mqtt.password")
     assert password.read_text() == PASSWORD
