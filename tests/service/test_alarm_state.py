@@ -356,7 +356,8 @@ BY_ID, TOPIC = "/dev/serial/by-id/usb-1a86_", {"kind": "mqtt", "profile": "espho
     ("former", "later", "is_raised"),
     [
         ({"sensor": {"port": BY_ID + "1"}}, {"sensor": {"port": BY_ID + "2"}}, False),
-        ({"source": TOPIC}, {"source": TOPIC | {"prefix": "jk-2"}}, False),
+        ({"source": TOPIC}, {"source": TOPIC | {"prefix": "jk-2"}, "pack": {"series": 16}}, False),
+        ({"source": TOPIC}, {"source": TOPIC | {"prefix": "jk-2"}}, True),  # the node may have been renamed, too
         ({"sensor": {"port": "/dev/ttyUSB0"}}, {"sensor": {"port": "/dev/ttyUSB1"}, "pack": {"series": 16}}, False),
         ({"sensor": {"port": "/dev/ttyUSB0"}}, {"sensor": {"port": "/dev/ttyUSB1"}}, True),
         ({"sensor": {"port": BY_ID + "1"}}, {"sensor": {"port": BY_ID + "1"}, "pack": {"series": 16}}, True),
@@ -366,7 +367,7 @@ BY_ID, TOPIC = "/dev/serial/by-id/usb-1a86_", {"kind": "mqtt", "profile": "espho
 def test_only_a_pack_that_is_surely_another_one_starts_beside_an_alarm_without_one(
     folder: Path, former: dict[str, Any], later: dict[str, Any], *, is_raised: bool
 ) -> None:
-    """On another device of the same kind, or with other cells and another device, it is another pack."""
+    """With other cells and another device, or on another device whose hardware gives the address, it is another pack."""
     file = StateFiles(folder, settings_on("pack", former), CELL).run_file
     file.save(file.load().counters)
     assert bool(StateFiles(folder, settings_on("new", later), CELL).run_file.load().lost_reason) == is_raised
