@@ -181,7 +181,7 @@ def test_an_identification_that_makes_replays_worse_is_rejected_with_the_scores(
     monkeypatch.setattr(module, "interval_score", lambda cell, *_: 1.5 if cell is given else 5.25)
     with pytest.raises(
         UserError,
-        match=r"^replays that start in mid-load get worse, .* from 1\.50 to 5\.25 % of SOC; nothing is written",
+        match=r"^replays that start in mid-load get worse: .* from 1\.50 to 5\.25 % of SOC; nothing is written",
     ) as caught:
         identify([warm], given)
     assert "warm: 1.50 before, 5.25 after" in str(caught.value)
