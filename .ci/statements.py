@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LIMITS = {"bms_estimator": 46_601, "tests": 49_456}
+LIMITS = {"bms_estimator": 46_601, "tests": 49_458}
 
 
 def is_text(node: ast.stmt) -> bool:
