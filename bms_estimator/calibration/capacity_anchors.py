@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import MIN_GAP_CHARGE
-from bms_estimator.calibration.cleaning.rests import remove_glitches, resting_samples, true_runs
-from bms_estimator.calibration.ocv.points import COLD_V, LONG_REST_S, RELAXED_V, relaxation_excess
+from bms_estimator.calibration.cleaning.clean_capture import remove_glitches, resting_samples, true_runs
+from bms_estimator.calibration.ocv.chen_mora_fit import COLD_V, LONG_REST_S, RELAXED_V, relaxation_excess
 from bms_estimator.calibration.ocv.relaxation_test import Rest, find_rests
 from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.kernels.cell_model.open_loop import hysteresis

@@ -19,7 +19,7 @@ from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, pola
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import FuelCellModel, Parameter
+from bms_estimator.model.pack_model import FuelCellModel, Parameter
 
 MAX_RELATIVE_STD = 0.3
 """Maximum relative std of a parameter that the data determine."""

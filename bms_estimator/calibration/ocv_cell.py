@@ -7,16 +7,20 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.cleaning.rests import remove_glitches
-from bms_estimator.calibration.cleaning.start_soc import FULL_SOC
+from bms_estimator.calibration.cleaning.capture_checks import FULL_SOC
+from bms_estimator.calibration.cleaning.clean_capture import remove_glitches
 from bms_estimator.calibration.elements.generic_prior import curve as generic_curve
 from bms_estimator.calibration.elements.generic_prior import nearest_generic_cell, scaled_generic_ladder
 from bms_estimator.calibration.elements.initial_elements import initial_elements
-from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv.hysteresis import center_on_typical_hysteresis, has_plateau
-from bms_estimator.calibration.ocv.points import Points
+from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, Points, fit_chen_mora
+from bms_estimator.calibration.ocv.hysteresis import (
+    ExternalCurve,
+    OcvSources,
+    Recording,
+    center_on_typical_hysteresis,
+    has_plateau,
+)
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v
-from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.estimator.settings_records import ocv_grid

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import true_runs
+from bms_estimator.calibration.cleaning.clean_capture import true_runs
 from bms_estimator.calibration.validate import GIVEN, LOW_SOC, UNDER_LOAD, Validation
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each

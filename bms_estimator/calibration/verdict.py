@@ -8,8 +8,7 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import LONG_REST_S, ends_of_long_rests
 from bms_estimator.calibration.reference import reference_faults
-from bms_estimator.calibration.soc_errors import SocErrors
-from bms_estimator.calibration.validate import LOW_SOC, Validation
+from bms_estimator.calibration.validate import LOW_SOC, SocErrors, Validation
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel, Grade
 from bms_estimator.model.sample import SampleBlock, capture_digest

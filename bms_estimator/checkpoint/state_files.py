@@ -20,9 +20,12 @@ import structlog
 from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.arrays_file import (
+    CHANGES_SUFFIXES,
     HISTORY_SUFFIX,
     LOAD_SUFFIX,
     ArraysFile,
+    BaseCheckpoint,
+    ChangesFile,
     RejectedFileError,
     observer_identity,
     pack_identity,
@@ -32,7 +35,6 @@ from bms_estimator.checkpoint.arrays_file import (
     without_observer,
     write_arrays,
 )
-from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, BaseCheckpoint, ChangesFile
 from bms_estimator.checkpoint.pack_description import PackDescription
 from bms_estimator.checkpoint.run_file import RunFile, SavedRun
 from bms_estimator.model.arrays import fields

@@ -24,7 +24,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.child_process import find_server, terminate_with_parent
-from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.runtime import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings

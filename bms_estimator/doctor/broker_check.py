@@ -13,10 +13,17 @@ from dataclasses import replace
 
 from bms_estimator.doctor import device_check
 from bms_estimator.doctor.finding import ExaminedPack, Finding, Level, fault, ok, warning
-from bms_estimator.mqtt.broker_config import Broker, brokers
 from bms_estimator.mqtt.client import Timeouts
-from bms_estimator.mqtt.connection import BrokerConnectionError, Connection, ConnectOptions, LoginError, Message
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.connection import (
+    Broker,
+    BrokerConnectionError,
+    Connection,
+    ConnectOptions,
+    LoginError,
+    Message,
+    brokers,
+)
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector
 from bms_estimator.process.systemd import is_unreadable_credential
 from bms_estimator.settings.broker import BrokerSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY

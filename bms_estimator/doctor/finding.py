@@ -9,8 +9,7 @@ from pathlib import Path
 from bms_estimator.doctor.systemd_unit import SystemdUnit
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.process.instance_lock import is_locked
-from bms_estimator.process.state_folder import state_folder_path
+from bms_estimator.process.state_folder import is_locked, state_folder_path
 from bms_estimator.settings.pack import Settings
 
 STATE_ROOT = Path("/var/lib")

@@ -25,14 +25,10 @@ from bms_estimator.edge.cell_voltages import MAX_CELLS
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.payloads.health import EdgeHealth
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
-from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.denied_topics import DeniedTopics
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
-from bms_estimator.mqtt.queue_sender import QueueSender
-from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.tasks import FIRST_DELAY_S, finish
+from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, DeliveryStats, brokers, check
+from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
+from bms_estimator.process.runtime import FIRST_DELAY_S, finish
 from bms_estimator.settings.exports import EdgeSettings
 from bms_estimator.store.database import RETRY_S, Database
 

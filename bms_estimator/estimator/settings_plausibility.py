@@ -17,8 +17,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.model.pack_model import PackModel
+from bms_estimator.model.pack_model import FuelCellModel, PackModel
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.can import CanSource

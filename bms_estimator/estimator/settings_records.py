@@ -22,9 +22,8 @@ from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.arrays import exp
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
-from bms_estimator.model.fuel_cell import FuelCellModel
 from bms_estimator.model.monotone_cubic import MonotoneCubic
-from bms_estimator.model.pack_model import PackModel
+from bms_estimator.model.pack_model import FuelCellModel, PackModel
 from bms_estimator.settings.observer import SCHEME_2_EPSILON, SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
 from bms_estimator.settings.sampling import EXACT, NO_LIMITS, ChargeLimits, Sampling
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
-from bms_estimator.forecast.available_power import DURATIONS_S, PowerLimits, known_power_w
-from bms_estimator.forecast.forecast import ForecastRows
+from bms_estimator.forecast.available_power import DURATIONS_S, ForecastRows, PowerLimits, known_power_w
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
 from bms_estimator.kernels.forecast.draws import DRAW

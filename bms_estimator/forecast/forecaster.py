@@ -10,10 +10,17 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.available_power import PowerLimits, PresentPower, cell_power_limits, raise_to_present
+from bms_estimator.forecast.available_power import (
+    Forecast,
+    ForecastCurve,
+    ForecastRows,
+    PowerLimits,
+    PresentPower,
+    cell_power_limits,
+    raise_to_present,
+    unknown_values,
+)
 from bms_estimator.forecast.capability import projected_pack, write_capability
-from bms_estimator.forecast.forecast import Forecast, ForecastCurve, ForecastRows, unknown_values
-from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import MINUTE_S, LoadHistory, PastMinutes, load_spread
 from bms_estimator.forecast.projection import (
     Projection,
@@ -23,6 +30,7 @@ from bms_estimator.forecast.projection import (
     project_until_load_end,
     time_quantiles,
 )
+from bms_estimator.forecast.trip import GivenLoad
 from bms_estimator.model.arrays import Floats, Records
 
 MIN_INTERVAL_S = 10.0

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.forecast.forecast import ForecastCurve
-from bms_estimator.forecast.given_load import GivenLoad
+from bms_estimator.forecast.available_power import ForecastCurve
 from bms_estimator.forecast.load_history import MINUTE_S, LoadSpread
+from bms_estimator.forecast.trip import GivenLoad
 from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
 from bms_estimator.kernels.forecast.draws import DRAW, draw_load_factors, draw_packs
 from bms_estimator.kernels.forecast.given_load import LOAD_PART, set_decays, simulate_given_load

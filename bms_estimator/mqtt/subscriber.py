@@ -8,13 +8,18 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.clock import Clock
-from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import BrokerConnectionError, Connect, Connection, ConnectOptions
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
-from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
+from bms_estimator.mqtt.connection import (
+    BrokerConnectionError,
+    Connect,
+    Connection,
+    ConnectOptions,
+    DeliveryStats,
+    brokers,
+    check,
+)
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics, TopicCache
-from bms_estimator.process.tasks import FIRST_DELAY_S, finish
+from bms_estimator.process.runtime import FIRST_DELAY_S, finish
 from bms_estimator.settings.mqtt import MqttSettings
 
 MAX_WAITING = 2000

@@ -13,8 +13,7 @@ from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import TraceBlock, compiled_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.estimator.restore import restore_state
-from bms_estimator.forecast.available_power import power_limits
-from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
+from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows, power_limits
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.load_history import restore_load
 from bms_estimator.kernels.trace import TRACE

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from bms_estimator.forecast.forecast import ForecastCurve
+from bms_estimator.forecast.available_power import ForecastCurve
 from bms_estimator.plot.style import COLORS, FAINT, MIN_SOC_SPAN_PERCENT, MIN_VOLTAGE_SPAN_V, draw_band, new_axes
 from bms_estimator.plot.time_series import label_axes, time_unit
 

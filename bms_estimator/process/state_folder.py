@@ -1,6 +1,13 @@
-"""State folder of a service."""
+"""State folder of a service, and the lock that lets only one process serve a pack at a time."""
 
+import contextlib
+import errno
+import hashlib
 import os
+import socket
+import struct
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import structlog
@@ -8,7 +15,118 @@ import structlog
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.settings.pack import Settings
 
+ROOT_USER = 0
+"""User id of root."""
+ATTEMPTS = 20
+"""Number of attempts to bind a name whose holder does not listen."""
+ATTEMPT_DELAY_S = 0.01
+"""Delay between two attempts to bind a name [s]."""
+SOCKETS = Path("/proc/net/unix")
+"""List of all Unix sockets. The names of abstract sockets begin with @."""
+_CREDENTIALS = struct.Struct("3i")
+"""Layout of ``struct ucred``: process, user, group."""
+
 log = structlog.get_logger(__name__)
+
+
+@contextlib.contextmanager
+def instance_lock(folder: Path, pack: str) -> Iterator[None]:
+    """Hold the lock of a pack, because two services would overwrite each other's checkpoint and availability.
+
+    The lock is an abstract socket named after folder and pack. It disappears with the process, cannot be deleted or left
+    over like a file, and does not depend on a disk. Any user of the machine could bind the name first. A holder without
+    write permission for the folder is therefore ignored. An unknown holder counts as a service, because two services do
+    more harm than no service. A container with its own network namespace has its own names.
+
+    Args:
+        folder: Folder of the pack's state.
+        pack: Name of the pack.
+
+    Raises:
+        TemporaryError: Another process serves the pack.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as lock:
+        try:
+            _bind(lock, folder, pack)
+        except OSError as error:
+            log.warning("cannot ensure that only one process serves this pack", reason=error.strerror)
+        yield
+
+
+def is_locked(folder: Path, pack: str) -> bool:
+    """Return True if a process holds the lock of a pack.
+
+    The list of sockets is read instead of connecting, because a connection would stay in the queue of the holder.
+    """
+    name = _socket_name(folder, pack).replace("\0", "@")
+    with contextlib.suppress(OSError):
+        return any(line.endswith(f" {name}") for line in SOCKETS.read_text(encoding="utf-8").splitlines())
+    return False
+
+
+def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
+    """Bind the name of the lock, unless a service has it.
+
+    Raises:
+        TemporaryError: A service has the name.
+        OSError: The system rejects the name.
+    """
+    name, process_id = _socket_name(folder, pack), None
+    for _ in range(ATTEMPTS):
+        try:
+            lock.bind(name)
+            lock.listen(1)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+        else:
+            return
+        try:
+            process, user = _find_holder(name)
+        except ConnectionRefusedError:  # the holder does not listen yet, or has just ended
+            time.sleep(ATTEMPT_DELAY_S)
+            continue
+        except BlockingIOError:
+            break
+        if user not in _find_writers(folder):
+            log.warning("another user holds this pack's lock: cannot ensure that only one process serves it", user=user)
+            return
+        process_id = process
+        break
+    raise TemporaryError(
+        f"{pack}: this pack is served already, by {f'process {process_id}' if process_id else 'another process'}; "
+        "stop it first"
+    )
+
+
+def _socket_name(folder: Path, pack: str) -> str:
+    """Return the name of the lock, a hash within the length limit of socket names."""
+    real_folder = os.path.realpath(folder)
+    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{real_folder}/{pack}')).hexdigest()[:32]}"
+
+
+def _find_holder(name: str) -> tuple[int, int]:
+    """Return process and user that hold a name.
+
+    Raises:
+        ConnectionRefusedError: No process holds the name, or the holder does not listen.
+        BlockingIOError: The listen queue of the holder is full. The holder never accepts a connection, so that clients
+            stay in the queue even after they have ended.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.setblocking(False)
+        client.connect(name)
+        credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    process, user, _ = _CREDENTIALS.unpack(credentials)
+    return process, user
+
+
+def _find_writers(folder: Path) -> set[int]:
+    """Return the users whose processes may serve the pack."""
+    users = {ROOT_USER, os.geteuid()}
+    with contextlib.suppress(OSError):
+        users.add(folder.stat().st_uid)
+    return users
 
 
 def state_folder_path(settings: Settings) -> Path:

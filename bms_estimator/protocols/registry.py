@@ -9,7 +9,7 @@ from collections.abc import Mapping
 
 from bms_estimator.protocols import devices
 from bms_estimator.protocols.base.device import Device, Sensor
-from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.base.reading_protocol import DeviceProtocol
 
 BOARD = "binary"
 """Name of the firmware's protocol. It is not a ``Device``, because its decoder imports numba, which other devices do not need."""

@@ -11,9 +11,8 @@ import numpy as np
 from bms_estimator import plot
 from bms_estimator.calibration.cleaning.capture_checks import ends_of_long_rests
 from bms_estimator.calibration.cleaning.data_quality import DataQuality
-from bms_estimator.calibration.soc_errors import SocErrors
 from bms_estimator.calibration.thesis.prediction import open_circuit
-from bms_estimator.calibration.validate import Validation
+from bms_estimator.calibration.validate import SocErrors, Validation
 from bms_estimator.calibration.verdict import Run, Verdict, judge
 from bms_estimator.estimator.stability_conditions import failed_conditions
 from bms_estimator.model.arrays import Floats

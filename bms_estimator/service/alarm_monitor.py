@@ -16,9 +16,9 @@ from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
+from bms_estimator.telemetry.alarms.causes import BoardResets
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.sensor_faults import BoardResets
 from bms_estimator.telemetry.cells import cell_alarm_inputs
 
 if TYPE_CHECKING:

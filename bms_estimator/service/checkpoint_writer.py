@@ -23,8 +23,8 @@ from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.service_status import ServiceStatus
+from bms_estimator.telemetry.alarms.definitions import INPUTS, PENDING, PROBES, SILENCE
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.saved_state import INPUTS, PENDING, PROBES, SILENCE
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals
 
 SOC_CHANGE = 0.002

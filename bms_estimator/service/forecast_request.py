@@ -8,10 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from bms_estimator.forecast.forecast import Forecast
+from bms_estimator.forecast.available_power import Forecast
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.forecast.trip import MAX_LOAD, MAX_TRIP_S, LoadQuantity, Trip, constant_trip, profile_trip
-from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
+from bms_estimator.forecast.trip import (
+    MAX_LOAD,
+    MAX_TRIP_S,
+    LoadQuantity,
+    Trip,
+    TripOutcome,
+    constant_trip,
+    profile_trip,
+    trip_outcome,
+)
 from bms_estimator.model.errors import UserError
 from bms_estimator.sinks.mqtt.requests import number
 

@@ -12,7 +12,7 @@ import structlog
 
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.mqtt.connection import OnResult
-from bms_estimator.process.tasks import Backoff
+from bms_estimator.process.runtime import Backoff
 from bms_estimator.service.hook import Hook
 from bms_estimator.service.hook_process import StartError, program_environment, run_program
 from bms_estimator.settings.alarms import AlarmHook, HookEvent

@@ -5,7 +5,7 @@ from typing import TypeVar
 from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.estimator.stability_conditions import observer_warnings
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.mqtt.broker_config import check as check_brokers
+from bms_estimator.mqtt.connection import check as check_brokers
 from bms_estimator.page.access_control import make_access_control
 from bms_estimator.process.systemd import is_unreadable_credential
 from bms_estimator.service.hook_check import hook_warnings

@@ -20,12 +20,10 @@ from bms_estimator.estimator.stability_conditions import observer_warnings
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.health import RecordingHealth
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.page.page_sink import Pages, PageSink
-from bms_estimator.process.instance_lock import instance_lock
-from bms_estimator.process.log_setup import set_level
-from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.process.state_folder import state_folder
+from bms_estimator.process.runtime import set_level, stop_on_signal
+from bms_estimator.process.state_folder import instance_lock, state_folder
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import has_relay

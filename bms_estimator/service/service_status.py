@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from bms_estimator.model.payloads.health import EdgeHealth, HookHealth, RecordingHealth
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.sources.source import SourceHealth
 from bms_estimator.telemetry.health import NO_FIT, FitTimes
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy

@@ -9,8 +9,7 @@ from typing import Literal, NamedTuple
 
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.fuel_cell import FuelCellModel
-from bms_estimator.model.pack_model import PackModel
+from bms_estimator.model.pack_model import FuelCellModel, PackModel
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, AlarmKind
 from bms_estimator.settings.alarms import ALARMS, AlarmName, AlarmRule
 from bms_estimator.settings.false_alarm_limits import (

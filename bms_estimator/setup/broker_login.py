@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Self
 from urllib.parse import quote, unquote
 
-from bms_estimator.mqtt.broker_config import parse_url
+from bms_estimator.mqtt.connection import parse_url
 
 ADDRESS_FORM = "mqtt://host:port, or with a login mqtt://user:pw@host; mqtts:// for TLS"
 """Form of an address. Characters of the user name may be percent-encoded, because : and @ are separators."""

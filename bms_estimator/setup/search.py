@@ -9,9 +9,8 @@ from urllib.parse import urlsplit
 
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, LoginError
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, LoginError, brokers, check
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.settings.sources.modbus import PROFILES as MODBUS_PROFILES

@@ -6,11 +6,8 @@ import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Self
 
-from bms_estimator.mqtt.broker_config import brokers
-from bms_estimator.mqtt.connection import Connection, ConnectOptions, Message
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
-from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
+from bms_estimator.mqtt.connection import Connection, ConnectOptions, DeliveryStats, Message, brokers
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.simulation.virtual_adc import Reading
 

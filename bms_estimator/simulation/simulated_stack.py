@@ -4,7 +4,7 @@ import numpy as np
 
 from bms_estimator.kernels.cell_model.fuel_cell import advance, load_file_constants, output, steady_state
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
-from bms_estimator.model.fuel_cell import FuelCellModel
+from bms_estimator.model.pack_model import FuelCellModel
 from bms_estimator.simulation.simulated_pack import Load
 from bms_estimator.simulation.virtual_adc import Reading
 

@@ -12,7 +12,7 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.process.tasks import FIRST_RETRY_S, MAX_RETRY_S
+from bms_estimator.process.runtime import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings

@@ -26,7 +26,7 @@ from bms_estimator.model.payloads.health import (
     Totals,
 )
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack_model.history import DAY_S
 from bms_estimator.pack_model.slow_fit import SlowFit
 

@@ -59,8 +59,7 @@ def fit_ocv_formula(cell: CellModel) -> OcvFormulaFit | None:
 
 @cache
 def _fit_table(ocv: TableOcv) -> OcvFormulaFit:
-    from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora  # noqa: PLC0415
-    from bms_estimator.calibration.ocv.points import Points, rms_v  # noqa: PLC0415
+    from bms_estimator.calibration.ocv.chen_mora_fit import Points, fit_chen_mora, rms_v  # noqa: PLC0415
 
     soc = np.linspace(0.0, 1.0, FIT_POINTS)
     fit = fit_chen_mora(Points(soc, MonotoneCubic(ocv.soc, ocv.ocv_v)(soc), np.ones(FIT_POINTS)))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.forecast.forecast import FORECAST, Forecast, unknown_values
+from bms_estimator.forecast.available_power import FORECAST, Forecast, unknown_values
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.clock import iso_utc

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.soc_errors import soc_errors
-from bms_estimator.calibration.validate import validate
+from bms_estimator.calibration.validate import soc_errors, validate
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, arrhenius

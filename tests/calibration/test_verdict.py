@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.soc_errors import SocErrors
-from bms_estimator.calibration.validate import validate
+from bms_estimator.calibration.validate import SocErrors, validate
 from bms_estimator.calibration.verdict import (
     Coverage,
     Run,

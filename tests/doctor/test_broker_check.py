@@ -9,7 +9,7 @@ import pytest
 from bms_estimator.doctor.broker_check import check_broker
 from bms_estimator.doctor.device_check import NOT_EXAMINED, SERIAL_REMEDY
 from bms_estimator.doctor.finding import ExaminedPack, Finding, Level
-from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.process.state_folder import instance_lock
 from tests.doctor.packs import subject
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener, password_broker

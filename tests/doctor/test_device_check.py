@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.doctor import device_check
 from bms_estimator.doctor.device_check import check_board, check_device, first_sample_timeout_s
 from bms_estimator.doctor.finding import Level
-from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.process.state_folder import instance_lock
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard

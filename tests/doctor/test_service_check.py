@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.doctor.finding import Level
 from bms_estimator.doctor.service_check import check_service, unit_finding
 from bms_estimator.doctor.systemd_unit import parse_units
-from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.process.state_folder import instance_lock
 from tests.doctor.packs import SYSTEMCTL_OUTPUT, subject, unit_with
 
 

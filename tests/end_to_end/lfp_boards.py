@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
 from typing import Protocol
 
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 from bms_estimator.simulation.virtual_adc import BoardParts
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from tests.end_to_end.lfp_pack import LfpPack

@@ -7,7 +7,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_slots import CellSlots
-from bms_estimator.protocols.base.device_protocol import cell_block
+from bms_estimator.protocols.base.reading_protocol import cell_block
 from bms_estimator.simulation.simulated_bank import BankCells
 from tests.benchmarks.cells import balanced_scores
 from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack

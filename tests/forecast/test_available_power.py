@@ -13,8 +13,8 @@ from bms_estimator.forecast.available_power import (
     PresentPower,
     power_limits,
     raise_to_present,
+    unknown_values,
 )
-from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.model.cell import CellModel, load_cell

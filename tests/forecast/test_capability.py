@@ -9,9 +9,8 @@ from scipy.optimize import brentq
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.forecast.available_power import QUANTILE_STDS, PowerLimits, cell_power_limits
+from bms_estimator.forecast.available_power import QUANTILE_STDS, PowerLimits, cell_power_limits, unknown_values
 from bms_estimator.forecast.capability import write_capability
-from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES, TAUS
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.projection import condense
+from bms_estimator.forecast.trip import GivenLoad
 
 
 def power_load(duration_s: list[float], power_w: list[float]) -> GivenLoad:

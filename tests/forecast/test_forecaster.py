@@ -5,9 +5,9 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast import projection
-from bms_estimator.forecast.forecast import FORECAST
+from bms_estimator.forecast.available_power import FORECAST
 from bms_estimator.forecast.forecaster import MAX_INTERVAL_S, Forecaster
-from bms_estimator.forecast.given_load import GivenLoad
+from bms_estimator.forecast.trip import GivenLoad
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.simulated_cell import TRUTH

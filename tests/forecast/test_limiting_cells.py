@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator.cell_estimator import CellDeviations
-from bms_estimator.forecast.available_power import PowerLimits
+from bms_estimator.forecast.available_power import PowerLimits, unknown_values
 from bms_estimator.forecast.capability import write_capability
-from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.kernels.cells.records import ReadingFault
 from bms_estimator.simulation.simulated_bank import BankCells
 from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bms_estimator.forecast.given_load import GivenLoad
 from bms_estimator.forecast.load_history import MINUTE_S, PEAK_S, LoadHistory, PastMinutes
 from bms_estimator.forecast.projection import MAX_STEPS, analogue_parts
+from bms_estimator.forecast.trip import GivenLoad
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK
 from bms_estimator.kernels.trace import TRACE
 

@@ -7,8 +7,7 @@ import pytest
 
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.forecast.trip import MAX_TRIP_S, constant_trip, profile_trip
-from bms_estimator.forecast.trip_outcome import TripOutcome, trip_outcome
+from bms_estimator.forecast.trip import MAX_TRIP_S, TripOutcome, constant_trip, profile_trip, trip_outcome
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE

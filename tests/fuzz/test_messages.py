@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from serial.tools.list_ports_common import ListPortInfo
 
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.mqtt.topic_cache import TopicCache
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
 from bms_estimator.sinks.terminal.screen import build_screen

@@ -9,7 +9,7 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_slots import CellSlots
-from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.base.reading_protocol import DeviceProtocol
 from bms_estimator.protocols.devices import daly, jbd, jk
 from bms_estimator.protocols.devices.junctek import JunctekProtocol
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol

@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.sample import NO_CELLS
-from bms_estimator.protocols.base.device_protocol import cell_block
+from bms_estimator.protocols.base.reading_protocol import cell_block
 
 NAN = np.nan
 LIVE = [3.31, 3.32, 3.33, 3.34]

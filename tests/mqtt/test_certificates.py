@@ -11,8 +11,7 @@ import pytest
 import structlog
 
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.mqtt.broker_config import check, tls_context
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats, check, tls_context
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink

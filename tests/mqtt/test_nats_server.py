@@ -9,9 +9,8 @@ from typing import Self
 import aiomqtt
 import pytest
 
-from bms_estimator.mqtt.broker_config import brokers
-from bms_estimator.mqtt.connection import ConnectOptions
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.connection import ConnectOptions, brokers
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.patience import until

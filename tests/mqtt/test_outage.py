@@ -9,7 +9,7 @@ import pytest
 import structlog
 
 from bms_estimator.mqtt.client import Timeouts
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy, read_packet

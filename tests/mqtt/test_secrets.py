@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import TemporaryError
-from bms_estimator.mqtt.broker_config import check
+from bms_estimator.mqtt.connection import check
 from bms_estimator.settings.mqtt import MqttSettings
 from tests.command_line import run
 

@@ -12,7 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.instance_lock import _socket_name, instance_lock
+from bms_estimator.process.state_folder import _socket_name, instance_lock
 
 NOBODY = 65534
 """User and group id of ``nobody``, who may not write to the folders of the tests."""

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 import structlog
 
-from bms_estimator.process import log_setup, stderr_writer
-from bms_estimator.process.log_setup import configure_logs, set_level
+from bms_estimator.process import runtime, stderr_writer
+from bms_estimator.process.runtime import configure_logs, set_level
 from bms_estimator.process.stderr_writer import Stderr
 from tests.patience import LONG_S
 
@@ -16,7 +16,7 @@ from tests.patience import LONG_S
 @pytest.fixture
 def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """Return the list that receives the log lines, with no level set by an earlier test."""
-    monkeypatch.setattr(log_setup, "_levels", {})
+    monkeypatch.setattr(runtime, "_levels", {})
     lines, configuration = list[str](), structlog.get_config()
     configure_logs(lines)
     yield lines
@@ -47,7 +47,7 @@ def test_a_logged_exception_has_no_local_variables(
     lines: list[str], monkeypatch: pytest.MonkeyPatch, is_readable: bool
 ) -> None:
     if not is_readable:
-        monkeypatch.setattr(log_setup, "stderr", SimpleNamespace(put=lines.append))
+        monkeypatch.setattr(runtime, "stderr", SimpleNamespace(put=lines.append))
         configure_logs()
     password = "not-for-the-log".upper()
     try:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.runtime import stop_on_signal
 from tests.patience import LONG_S
 
 

@@ -3,7 +3,7 @@
 import asyncio
 from contextlib import suppress
 
-from bms_estimator.process.tasks import FIRST_DELAY_S, MAX_DELAY_S, Backoff, end, until_first_ends
+from bms_estimator.process.runtime import FIRST_DELAY_S, MAX_DELAY_S, Backoff, end, until_first_ends
 
 
 def test_delays_double_up_to_the_maximum_and_differ_between_clients() -> None:

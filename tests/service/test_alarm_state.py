@@ -27,8 +27,8 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.mqtt.connection import DeliveryStats
+from bms_estimator.process.state_folder import instance_lock
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.service import checkpoint_writer, relay_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks

@@ -22,7 +22,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_monitor import AlarmMonitor

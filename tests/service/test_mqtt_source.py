@@ -11,7 +11,7 @@ import aiomqtt
 from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.pack import Settings

@@ -22,7 +22,7 @@ from bms_estimator.model.events import events
 from bms_estimator.model.payloads.health import PackModelHealth
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.sample import NO_CELLS, SampleBlock
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import slow_fit as slow_fit_module

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.checkpoint.run_file import RunFile
-from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.process.state_folder import instance_lock
 from tests.command_line import PROGRAM, run, running_program
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.pack_model import load_fuel_cell
 from bms_estimator.settings.alarm_limits import WEAK_CELL_CLEAR_FRACTION, WEAK_CELL_STD, monitored_alarms
 from bms_estimator.settings.false_alarm_limits import (
     COLLAPSE_FALSE_ALARMS,

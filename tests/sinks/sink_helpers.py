@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.mqtt.queue_sender import WINDOW
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.requests import COMMANDS, RequestDispatcher

@@ -3,15 +3,14 @@
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.forecast.forecast import Forecast, ForecastCurve, unknown_values
+from bms_estimator.forecast.available_power import Forecast, ForecastCurve, unknown_values
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.fuel_cell import load_fuel_cell
-from bms_estimator.model.pack_model import PackModel
+from bms_estimator.model.pack_model import PackModel, load_fuel_cell
 from bms_estimator.model.payloads.health import LoopHealth
 from bms_estimator.model.payloads.snapshot import Alarm, CellReport, CellsReport, Snapshot
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.health import make_health_payload
 from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, new_totals

@@ -9,7 +9,7 @@ import pytest
 from bms_estimator.kernels.alarms.quantities import update_quantities
 from bms_estimator.kernels.alarms.records import ALARMS, EVALUATION_IO, LIMITS, LOG, NAMES, SETTINGS, TEMPERATURE
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.telemetry.alarms.saved_state import decode
+from bms_estimator.telemetry.alarms.definitions import decode
 
 
 def change_times_s(present: Sequence[bool], steps_s: float, lost_s: float = 10.0, *, lost: bool = True) -> list[float]:

@@ -1,6 +1,6 @@
 """Repeated resets of the sensor board."""
 
-from bms_estimator.telemetry.alarms.sensor_faults import RESET_WINDOW_S, RESETS_TEXT, BoardResets
+from bms_estimator.telemetry.alarms.causes import RESET_WINDOW_S, RESETS_TEXT, BoardResets
 
 
 def test_three_resets_within_half_an_hour_are_a_fault_until_the_first_is_half_an_hour_ago() -> None:

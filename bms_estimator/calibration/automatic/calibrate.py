@@ -10,17 +10,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bms_estimator.calibration.automatic.capacity_estimate import CapacityEstimate, estimate_capacity, largest_swing_ah
-from bms_estimator.calibration.automatic.hold_back import Split, hold_back, use_all
-from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFitter
-from bms_estimator.calibration.automatic.recognition import RecognizedCapture, recognize
-from bms_estimator.calibration.cleaning.start_soc import StartOrigin
+from bms_estimator.calibration.automatic.model_fit import FittedModel, ModelFitter, Split, hold_back, use_all
+from bms_estimator.calibration.automatic.recognition import (
+    CapacityEstimate,
+    RecognizedCapture,
+    estimate_capacity,
+    largest_swing_ah,
+    recognize,
+)
+from bms_estimator.calibration.cleaning.capture_checks import StartOrigin
 from bms_estimator.calibration.elements.generic_prior import ocv_rms_difference_v
-from bms_estimator.calibration.ocv.source import ExternalCurve
+from bms_estimator.calibration.ocv.hysteresis import ExternalCurve
 from bms_estimator.calibration.ocv.table_fit import NODES
 from bms_estimator.calibration.ocv_cell import OcvCell
-from bms_estimator.calibration.soc_errors import soc_errors
-from bms_estimator.calibration.validate import Validation, validate
+from bms_estimator.calibration.validate import Validation, soc_errors, validate
 from bms_estimator.calibration.verdict import Run, Verdict, coverage, judge, voltage_errors
 from bms_estimator.model.cell import CellModel, generic_cells, load_cell, with_capacity
 from bms_estimator.model.columns import Columns

@@ -1,4 +1,4 @@
-"""A capture without glitches, prepared for calibration."""
+"""A capture without glitches, prepared for calibration: coulomb counting by (2.1) of the thesis, and detection of rests."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,119 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.mismatched_steps import are_mismatched, with_matched_voltages
-from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, select_samples
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
+
+GLITCH_FRACTION = 0.5
+"""Maximum deviation of a voltage from the median, as a fraction of the median. A larger deviation is a fault of the
+instrument, because no Li-ion cell has such a range."""
+MAX_BACKWARD_FRACTION = 0.1
+"""Maximum fraction of samples whose timestamp is lower than an earlier timestamp. A small correction of a clock causes few
+such samples."""
+MIN_PLAUSIBLE_FRACTION = 0.5
+"""Minimum fraction of good voltages. With fewer, the median may be a glitch, so that glitches are not
+recognized."""
+REST_C_RATE = 0.01
+"""Maximum C-rate of a rest [1/h]. It changes SOC by only 0.25 % in a rest of 15 min."""
+NOISE_STDS = 6.0
+"""Maximum current of a rest, in standard deviations of the current's noise."""
+NOISE_STEP_C_RATE = 0.1
+"""Changes of the current between two samples below this C-rate [1/h] count as noise, larger ones as load."""
+MIN_LOAD_CHARGE = 2e-5
+"""Minimum charge of a load that interrupts a rest, as a fraction of the capacity: 1 C for 72 ms. Less is a glitch of the
+sensor."""
+SOC_SLACK = 0.03
+"""Tolerance of the counted SOC outside 0..1, because the capacities of cells of one type differ by as much."""
+
+
+def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
+    """Return the samples that are finite, later than all samples before, and within 50 % of the median voltage.
+
+    The median is taken over the voltages above 0 V.
+
+    Raises:
+        UserError: Nothing is left, most voltages are glitches, or the time goes back.
+    """
+    finite = np.isfinite(samples["time_s"]) & np.isfinite(samples["current_a"]) & np.isfinite(samples["voltage_v"])
+    good = select_samples(samples, finite)
+    if good.size == 0:
+        raise UserError(f"{name}: none of {samples.size} samples has finite time, current and voltage")
+    positive_v = good["voltage_v"][good["voltage_v"] > 0.0]
+    if positive_v.size == 0:
+        raise UserError(
+            f"{name}: none of {samples.size} samples has a voltage above 0 V, the largest is {good['voltage_v'].max():g} V"
+        )
+    median_v = float(np.median(positive_v))
+    is_glitch = np.abs(good["voltage_v"] - median_v) > GLITCH_FRACTION * median_v
+    if is_glitch.mean() > 1.0 - MIN_PLAUSIBLE_FRACTION:
+        first = good[int(np.argmax(is_glitch))]
+        raise UserError(
+            f"{name}: {is_glitch.sum()} of {samples.size} samples are glitches, the first at {first['time_s']:.0f} s with "
+            f"{first['voltage_v']:.3f} V where the median is {median_v:.3f} V: check the sensor's wiring"
+        )
+    good = select_samples(good, ~is_glitch)
+    latest = np.maximum.accumulate(good["time_s"])
+    is_earlier = good["time_s"] < latest
+    if is_earlier.mean() > MAX_BACKWARD_FRACTION:
+        first = int(np.argmax(is_earlier))
+        raise UserError(
+            f"{name}: time goes back {(np.diff(good['time_s']) < 0.0).sum()} times, first from {latest[first]:g} to "
+            f"{good['time_s'][first]:g} s, and {is_earlier.sum()} of {samples.size} samples are earlier than one before them: the file "
+            "contains several captures, or a clock was set; give each stretch as a file of its own"
+        )
+    is_later = np.r_[True, good["time_s"][1:] > latest[:-1]]
+    return select_samples(good, is_later)
+
+
+def select_samples(samples: SampleBlock, mask: NDArray[np.bool_]) -> SampleBlock:
+    """Return the samples for which ``mask`` is True: ``samples`` itself if all are, because a long capture is large."""
+    return samples if mask.all() else samples[mask]
+
+
+def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float = 1.0) -> Floats:
+    """Return SOC at every sample by coulomb counting, (2.1). Shape (n,), not limited to 0..1.
+
+    ``charge_ah`` integrates the current, which counts as 0 in gaps of more than an hour.
+    """
+    return initial_soc - charge_ah(samples["time_s"], samples["current_a"]) / capacity_ah
+
+
+def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
+    """Return which samples belong to a rest. Short glitches of the current sensor do not end a rest."""
+    resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
+    time_s = good["time_s"]
+    for first, last in true_runs(~resting):
+        until_s = time_s[min(last, good.size - 1)]
+        load_ah = abs(float(good["current_a"][first:last].mean())) * (until_s - time_s[first]) / 3600.0
+        if load_ah < MIN_LOAD_CHARGE * capacity_ah:
+            resting[first:last] = True
+    return resting
+
+
+def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
+    """Return the maximum current of a rest [A]: a small C-rate or the sensor's noise, limited to half of the load."""
+    change_a = np.diff(current_a)
+    small_a = change_a[np.abs(change_a) < NOISE_STEP_C_RATE * capacity_ah]
+    noise_a = float(np.sqrt(np.mean(small_a**2) / 2.0)) if small_a.size else 0.0  # a difference has twice the variance
+    # a periodic load must not count as noise: the limit is below half of the 95th percentile of the current
+    half_load_a = 0.5 * float(np.quantile(np.abs(current_a), 0.95))
+    return max(REST_C_RATE * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
+
+
+def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the runs of True in ``mask``, each as (first index, index after the last)."""
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def mean_temperature_c(samples: SampleBlock) -> float:
+    """Return the mean of the reported temperatures [C]; NaN without a sensor."""
+    reported_c = samples["temperature_c"][np.isfinite(samples["temperature_c"])]
+    return float(reported_c.mean()) if reported_c.size else float("nan")
+
 
 NEIGHBORS = 2
 """Number of neighbors on each side of a sample. A sample is compared with the median of itself and its neighbors."""

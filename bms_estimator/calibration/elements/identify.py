@@ -16,24 +16,29 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import (
     capture_contradictions,
     step_resistance,
+    undetermined_start,
     without_excitation,
 )
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
-from bms_estimator.calibration.cleaning.start_soc import undetermined_start
-from bms_estimator.calibration.elements import two_branch_fit
-from bms_estimator.calibration.elements.capture_run import (
+from bms_estimator.calibration.elements.cell_from_fit import (
+    MIN_RMS_SOC,
+    SECTIONS,
+    cell_from_fit,
+    ladder_prior,
+    voltage_rms_v,
+)
+from bms_estimator.calibration.elements.identification import CaptureFit, Identification
+from bms_estimator.calibration.elements.ladder_columns import correction_at
+from bms_estimator.calibration.elements.ladder_fit import (
     MIN_SPAN_K,
+    LadderFit,
     Run,
+    fit_ladder,
     make_run,
     spans_temperature,
     temperature_contradictions,
     temperature_range,
 )
-from bms_estimator.calibration.elements.cell_from_fit import MIN_RMS_SOC, cell_from_fit, voltage_rms_v
-from bms_estimator.calibration.elements.identification import CaptureFit, Identification
-from bms_estimator.calibration.elements.ladder_columns import correction_at
-from bms_estimator.calibration.elements.ladder_fit import LadderFit, fit_ladder
-from bms_estimator.calibration.elements.ladder_prior import ladder_prior
 from bms_estimator.calibration.elements.normal_equations import NormalEquations, normal_equations
 from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.ocv.overpotential import ocv_offset
@@ -103,7 +108,7 @@ class Candidate:
         return Identification(
             cell=self.cell,
             elements={
-                soc: {name: self.fit.resistance_sum(soc, *indices) for name, indices in two_branch_fit.SECTIONS.items()}
+                soc: {name: self.fit.resistance_sum(soc, *indices) for name, indices in SECTIONS.items()}
                 for soc in REPORTED_SOC
             },
             captures=fits,

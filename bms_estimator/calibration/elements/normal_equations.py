@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
-from bms_estimator.calibration.cleaning.rests import true_runs
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, true_runs
 from bms_estimator.calibration.elements.ladder_columns import model_rows
 from bms_estimator.calibration.ocv.overpotential import arrhenius
 from bms_estimator.kernels.cell_model.open_loop import branch_currents

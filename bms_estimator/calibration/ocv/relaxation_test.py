@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.cleaning.mismatched_steps import with_matched_voltages
-from bms_estimator.calibration.cleaning.rests import (
+from bms_estimator.calibration.cleaning.clean_capture import (
     SOC_SLACK,
     mean_temperature_c,
     remove_glitches,
@@ -19,6 +18,7 @@ from bms_estimator.calibration.cleaning.rests import (
     soc_by_counting,
     true_runs,
 )
+from bms_estimator.calibration.cleaning.mismatched_steps import with_matched_voltages
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
-from bms_estimator.calibration.cleaning.rests import SOC_SLACK
-from bms_estimator.calibration.ocv.points import COLD_V, Points, relaxation_excess
+from bms_estimator.calibration.cleaning.clean_capture import SOC_SLACK
+from bms_estimator.calibration.ocv.chen_mora_fit import COLD_V, Points, relaxation_excess
 from bms_estimator.calibration.ocv.slow_branch import SlowBranch
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError

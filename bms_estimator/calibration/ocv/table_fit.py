@@ -19,8 +19,8 @@ import numpy as np
 from scipy.interpolate import BSpline, PchipInterpolator
 from scipy.optimize import lsq_linear
 
+from bms_estimator.calibration.ocv.chen_mora_fit import Points, check_points, rms_v, with_ends
 from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
-from bms_estimator.calibration.ocv.points import Points, check_points, rms_v, with_ends
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import TableOcv

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
-from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture
-from bms_estimator.calibration.cleaning.rests import remove_glitches
-from bms_estimator.calibration.cleaning.start_soc import initial_soc
+from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, initial_soc
+from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture, remove_glitches
 from bms_estimator.calibration.elements.cell_from_fit import MIN_ERROR_V
 from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO
 from bms_estimator.calibration.elements.replay_score import interval_score

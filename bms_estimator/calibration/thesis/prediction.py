@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
+from bms_estimator.calibration.cleaning.clean_capture import remove_glitches, soc_by_counting
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv_of_each, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.model.arrays import Floats

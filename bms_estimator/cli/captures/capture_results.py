@@ -6,12 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.data_quality import data_quality
-from bms_estimator.calibration.soc_errors import BLOCK_SAMPLES, first_time_s, soc_errors
-from bms_estimator.calibration.validate import Validation, validate
+from bms_estimator.calibration.validate import BLOCK_SAMPLES, Validation, first_time_s, soc_errors, validate
 from bms_estimator.calibration.verdict import is_fitted_to
-from bms_estimator.cli.options.capture_input import read_with_bar
-from bms_estimator.cli.options.compile_progress import compile_ahead
-from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.cli.options.capture_options import read_with_bar
+from bms_estimator.cli.options.compile_progress import compile_ahead, progress_bar
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel

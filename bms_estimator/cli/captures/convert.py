@@ -12,13 +12,16 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses, print_warnings
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     Force,
     MappedColumns,
     SignOfCurrent,
+    capture_file,
     check_output_file,
+    long_file_bar,
+    print_guesses,
+    print_warnings,
 )
 from bms_estimator.model.arrays import Records, structured_array
 from bms_estimator.model.cell_voltage_columns import cell_voltage_columns

@@ -18,7 +18,6 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.cli.captures.replay_summary import ReplayResult, Summary
-from bms_estimator.cli.options.capture_input import capture_file, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     CELL_OR_FUEL_CELL_HELP,
@@ -28,19 +27,25 @@ from bms_estimator.cli.options.capture_options import (
     MappedColumns,
     SignOfCurrent,
     SocOfEstimator,
+    capture_file,
     check_output_file,
     complete_cell,
+    print_guesses,
 )
-from bms_estimator.cli.options.compile_progress import compile_ahead
-from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_broker, with_pack
-from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.cli.options.compile_progress import compile_ahead, progress_bar
+from bms_estimator.cli.options.pack_options import (
+    decimal,
+    pack_or_cell,
+    reject_soc_for_fuel_cell,
+    with_broker,
+    with_pack,
+)
 from bms_estimator.model.arrays import Records
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack.pack import Pack, RunResult, new_pack
 from bms_estimator.service.kernel_warm_up import load_forecast_kernels
 from bms_estimator.service.publisher import Publisher

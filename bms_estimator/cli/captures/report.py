@@ -13,7 +13,6 @@ from bms_estimator.calibration.verdict import Verdict
 from bms_estimator.checkpoint.arrays_file import RejectedFileError
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.captures.capture_results import capture_result
-from bms_estimator.cli.options.capture_input import capture_files, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
@@ -23,12 +22,13 @@ from bms_estimator.cli.options.capture_options import (
     Series,
     SignOfCurrent,
     TemperatureWithoutSensor,
+    capture_files,
     check_output_file,
+    print_guesses,
     reject_duplicates,
     unique_names,
 )
-from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.pack_options import load_pack, pack_or_cell, with_pack
+from bms_estimator.cli.options.pack_options import decimal, load_pack, pack_or_cell, with_pack
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.identified_parameters import present_elements, relative_capacity
 from bms_estimator.model.arrays import Floats

@@ -11,7 +11,6 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
@@ -19,12 +18,12 @@ from bms_estimator.cli.options.capture_options import (
     MappedColumns,
     SignOfCurrent,
     complete_battery,
+    load_captures,
     name_of,
     reject_duplicates,
 )
-from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.pack_options import LABORATORY_RESOLUTION_V
-from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.cli.options.compile_progress import progress_bar
+from bms_estimator.cli.options.pack_options import LABORATORY_RESOLUTION_V, decimal
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import CurrentSign

@@ -11,10 +11,8 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from bms_estimator.calibration.soc_errors import soc_errors
-from bms_estimator.calibration.validate import Errors, Validation, validate
+from bms_estimator.calibration.validate import Errors, Validation, soc_errors, validate
 from bms_estimator.calibration.verdict import Run, Verdict, is_fitted_to, judge
-from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     AsJson,
@@ -26,11 +24,10 @@ from bms_estimator.cli.options.capture_options import (
     SignOfCurrent,
     TemperatureWithoutSensor,
     check_output_file,
+    load_captures,
 )
-from bms_estimator.cli.options.compile_progress import compile_ahead
-from bms_estimator.cli.options.number_options import decimal
-from bms_estimator.cli.options.pack_options import pack_or_cell, with_pack
-from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.cli.options.compile_progress import compile_ahead, progress_bar
+from bms_estimator.cli.options.pack_options import decimal, pack_or_cell, with_pack
 from bms_estimator.model.arrays import Records, structured_array
 from bms_estimator.model.sample import fill_temperature
 from bms_estimator.pack.pack import new_pack

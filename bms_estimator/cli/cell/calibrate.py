@@ -24,7 +24,6 @@ from bms_estimator.cli.cell.calibrate_live import RelayOptions, run_guided_test
 from bms_estimator.cli.cell.calibration_input import given_cell, load_captures_and_curves, split_inputs
 from bms_estimator.cli.cell.calibration_session import open_session
 from bms_estimator.cli.cell.load_switch import relay_program
-from bms_estimator.cli.options.capture_input import capture_files
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
@@ -34,12 +33,13 @@ from bms_estimator.cli.options.capture_options import (
     Series,
     SignOfCurrent,
     TemperatureWithoutSensor,
+    capture_files,
     check_output_file,
     name_of,
     reject_duplicates,
 )
-from bms_estimator.cli.options.number_options import decimal, whole
-from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.cli.options.compile_progress import progress_bar
+from bms_estimator.cli.options.pack_options import decimal, whole
 from bms_estimator.model.cell import fitted_to
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.pack_model import write_cell

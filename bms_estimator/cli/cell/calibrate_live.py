@@ -23,9 +23,7 @@ from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.log_setup import configure_logs
-from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.process.tasks import end, until_first_ends
+from bms_estimator.process.runtime import configure_logs, end, stop_on_signal, until_first_ends
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from bms_estimator.calibration.ocv.source import ExternalCurve
-from bms_estimator.cli.options.capture_input import load_captures
-from bms_estimator.cli.options.capture_options import unique_names
+from bms_estimator.calibration.ocv.hysteresis import ExternalCurve
+from bms_estimator.cli.options.capture_options import load_captures, unique_names
 from bms_estimator.cli.options.pack_options import single_cell_of, with_pack
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.columns import Columns

@@ -12,9 +12,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit
-from bms_estimator.calibration.ocv.points import max_v, rms_v
-from bms_estimator.calibration.ocv.source import OcvSources, Recording
+from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit, max_v, rms_v
+from bms_estimator.calibration.ocv.hysteresis import OcvSources, Recording
 from bms_estimator.calibration.ocv.table_fit import TableFit
 from bms_estimator.calibration.ocv_cell import OcvCell, OcvForm, determine_ocv
 from bms_estimator.cli.cell.calibration_input import load_captures_and_curves
@@ -30,7 +29,7 @@ from bms_estimator.cli.options.capture_options import (
     reject_duplicates,
     write_cell_named_as_file,
 )
-from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.pack_options import decimal, whole
 from bms_estimator.telemetry.state import finite
 
 STEEP_SOC = 0.05

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
-from bms_estimator.cli.options.number_options import whole
+from bms_estimator.cli.options.pack_options import whole
 
 
 def fit(
@@ -20,8 +20,11 @@ def fit(
     Each fit takes about a second of one CPU. With too few processes, fits are late.
     """
     from bms_estimator.fleet.fits.fitter import Options, fit_packs  # noqa: PLC0415 - its packages are optional
-    from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
-    from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
+    from bms_estimator.process.runtime import (  # noqa: PLC0415
+        configure_logs,
+        flush_logs,
+        stop_on_signal,
+    )
 
     async def run() -> None:
         await fit_packs(Options(server, creds, ca, processes), stop_on_signal())

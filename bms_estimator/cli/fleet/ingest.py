@@ -67,8 +67,11 @@ def ingest(
     """
     from bms_estimator.fleet.ingest.ingest import ingest  # noqa: PLC0415 - its packages are optional
     from bms_estimator.fleet.ingest.startup import Options  # noqa: PLC0415
-    from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
-    from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
+    from bms_estimator.process.runtime import (  # noqa: PLC0415
+        configure_logs,
+        flush_logs,
+        stop_on_signal,
+    )
 
     options = Options(
         server, folder or _default_folder(), block_s, round(buffer_gb * GB), creds, ca, columns, current_sign

@@ -10,7 +10,7 @@ from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Se
 from bms_estimator.cli.options.page_options import Browser, TokenFile, page_settings, serve
 from bms_estimator.fleet.page import nats_feed
 from bms_estimator.fleet.page.fleet_page import fleet_page
-from bms_estimator.process.log_setup import configure_logs, flush_logs
+from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.settings.page import PageSettings
 
 DEFAULT_LISTEN = "127.0.0.1:8080"

@@ -31,7 +31,7 @@ def collect(
 ) -> None:
     """Write the hourly summaries of all packs, which the workers publish, to Parquet files, until SIGINT, SIGTERM or SIGHUP."""
     from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
-    from bms_estimator.process.log_setup import configure_logs, flush_logs  # noqa: PLC0415
+    from bms_estimator.process.runtime import configure_logs, flush_logs  # noqa: PLC0415
 
     configure_logs()
     with flush_logs(), only_collector(folder):
@@ -41,8 +41,7 @@ def collect(
 async def _collect(address: ServerAddress, folder: Path, period_s: float) -> None:
     from bms_estimator.fleet.nats.connection import close, connect  # noqa: PLC0415
     from bms_estimator.fleet.queries.collector import Collector  # noqa: PLC0415
-    from bms_estimator.process.signals import stop_on_signal  # noqa: PLC0415
-    from bms_estimator.process.tasks import end  # noqa: PLC0415
+    from bms_estimator.process.runtime import end, stop_on_signal  # noqa: PLC0415
 
     server, creds, ca = address
     stop = stop_on_signal()

@@ -18,7 +18,7 @@ from bms_estimator.fleet.server.nats_server import serve as run_node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.model.config_file import error_reason, read_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.log_setup import configure_logs, flush_logs
+from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.settings.fleet import FleetSettings
 from bms_estimator.settings.pack import DeviceName
 from bms_estimator.settings.page import parse_listen

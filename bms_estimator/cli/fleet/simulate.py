@@ -10,14 +10,14 @@ from typing import Annotated
 import typer
 from pydantic import TypeAdapter, ValidationError
 
-from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.pack_options import decimal, whole
 from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.config_file import without_secrets, write_text
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.broker_config import check as check_broker_settings
-from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.mqtt.connection import check as check_broker_settings
+from bms_estimator.process.runtime import stop_on_signal
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import DeviceName
 

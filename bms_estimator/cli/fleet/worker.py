@@ -14,8 +14,7 @@ from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.fleet.worker.worker import CHECKPOINT_S, Options, work
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.log_setup import configure_logs, flush_logs
-from bms_estimator.process.signals import exit_on_startup_signals, stop_on_signal
+from bms_estimator.process.runtime import configure_logs, exit_on_startup_signals, flush_logs, stop_on_signal
 
 _MAX_NAME_LENGTH = 64
 _VALID_NAME = re.compile(f"[A-Za-z0-9_-]{{1,{_MAX_NAME_LENGTH}}}")

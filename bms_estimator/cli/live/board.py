@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.number_options import decimal, whole
-from bms_estimator.cli.options.port_options import complete_port
+from bms_estimator.cli.options.pack_options import decimal, whole
+from bms_estimator.cli.options.page_options import complete_port
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.protocols.firmware.messages import (

@@ -9,7 +9,7 @@ import typer
 from bms_estimator.cli.options.pack_options import with_broker
 from bms_estimator.cli.options.page_options import Browser, TokenFile, page_settings, serve
 from bms_estimator.page.broker_page import dashboard as broker_page
-from bms_estimator.process.log_setup import configure_logs, flush_logs
+from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.pack import Settings, load_settings

@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.compile_progress import compile_ahead
-from bms_estimator.cli.options.number_options import decimal, whole
+from bms_estimator.cli.options.pack_options import decimal, whole
 from bms_estimator.cli.options.page_options import open_browser
 from bms_estimator.demo.demo import run_demo
-from bms_estimator.process.log_setup import configure_logs, flush_logs
+from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.sinks.terminal.screen import LOG_LINES
 

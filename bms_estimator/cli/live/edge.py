@@ -11,15 +11,19 @@ import structlog
 import typer
 
 from bms_estimator.cli.options.pack_options import with_sensor
-from bms_estimator.cli.options.port_options import PortOverride
+from bms_estimator.cli.options.page_options import PortOverride
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.instance_lock import instance_lock
-from bms_estimator.process.log_setup import configure_logs, flush_logs, set_level
-from bms_estimator.process.signals import exit_on_startup_signals, stop_on_signal
-from bms_estimator.process.state_folder import state_folder
+from bms_estimator.process.runtime import (
+    configure_logs,
+    exit_on_startup_signals,
+    flush_logs,
+    set_level,
+    stop_on_signal,
+    until_first_ends,
+)
+from bms_estimator.process.state_folder import instance_lock, state_folder
 from bms_estimator.process.systemd import SystemdNotifier
-from bms_estimator.process.tasks import until_first_ends
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.factory import open_device, pair_with_bms
 from bms_estimator.sources.line_source import LineSource

@@ -12,7 +12,7 @@ from typing import IO, Annotated
 import typer
 
 from bms_estimator.cli.options.capture_options import Force, check_output_file
-from bms_estimator.cli.options.number_options import whole
+from bms_estimator.cli.options.pack_options import whole
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder

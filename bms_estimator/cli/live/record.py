@@ -11,13 +11,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from bms_estimator.cli.options.number_options import decimal, whole
-from bms_estimator.cli.options.pack_options import load_pack, with_sensor
-from bms_estimator.cli.options.port_options import PortOverride
+from bms_estimator.cli.options.pack_options import decimal, load_pack, whole, with_sensor
+from bms_estimator.cli.options.page_options import PortOverride
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.log_setup import configure_logs, flush_logs
-from bms_estimator.process.signals import stop_on_signal
-from bms_estimator.process.tasks import until_first_ends
+from bms_estimator.process.runtime import configure_logs, flush_logs, stop_on_signal, until_first_ends
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder

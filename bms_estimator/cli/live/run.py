@@ -14,11 +14,10 @@ import typer
 
 from bms_estimator.cli.options.compile_progress import compile_ahead
 from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
-from bms_estimator.cli.options.port_options import PortOverride
+from bms_estimator.cli.options.page_options import PortOverride
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.process.log_setup import configure_logs, flush_logs
-from bms_estimator.process.signals import exit_on_startup_signals
+from bms_estimator.process.runtime import configure_logs, exit_on_startup_signals, flush_logs
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.service.pack_service import run_pack_service, run_pack_services

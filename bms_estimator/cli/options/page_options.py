@@ -1,4 +1,4 @@
-"""Options of commands that serve a page."""
+"""Options of commands that serve a page or read a serial port."""
 
 import os
 import sys
@@ -13,8 +13,22 @@ from pydantic import ValidationError
 
 from bms_estimator.model.config_file import error_reason
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.runtime import stop_on_signal
 from bms_estimator.settings.page import PageSettings
+from bms_estimator.sources.serial.port_list import named_ports
+
+
+def complete_port(incomplete: str) -> list[str]:
+    """Return the connected serial ports whose names begin with ``incomplete``."""
+    return [name for name in named_ports() if name.startswith(incomplete)]
+
+
+PortOverride = Annotated[
+    str | None,
+    typer.Option(help="serial port that replaces sensor.port of the settings", autocompletion=complete_port),
+]
+"""Option that replaces the serial port of the settings."""
+
 
 TokenFile = Annotated[Path | None, typer.Option(help="file with the access token of the page", show_default=False)]
 Browser = Annotated[

@@ -14,14 +14,14 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.compile_progress import compile_ahead
-from bms_estimator.cli.options.number_options import decimal
+from bms_estimator.cli.options.pack_options import decimal
 from bms_estimator.cli.options.table import show_status
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
 from bms_estimator.cli.settings.prompts import Prompts
 from bms_estimator.installation.root_command import root_command
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.log_setup import configure_logs
+from bms_estimator.process.runtime import configure_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack_file import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError

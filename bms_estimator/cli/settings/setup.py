@@ -9,10 +9,9 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.number_options import whole
+from bms_estimator.cli.options.pack_options import whole
 from bms_estimator.cli.options.page_options import Browser, TokenFile, open_browser, page_settings
-from bms_estimator.process.log_setup import configure_logs
-from bms_estimator.process.signals import stop_on_signal
+from bms_estimator.process.runtime import configure_logs, stop_on_signal
 from bms_estimator.settings.pack_file import require_new
 from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
 from bms_estimator.setup.page.setup_server import SetupServer

@@ -24,7 +24,7 @@ from bms_estimator.fleet.demo.progress import Progress
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
 from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
-from bms_estimator.process.tasks import until_first_ends
+from bms_estimator.process.runtime import until_first_ends
 
 
 async def stored_blocks(nc: Client) -> int:

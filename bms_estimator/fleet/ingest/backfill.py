@@ -21,7 +21,7 @@ from bms_estimator.fleet.ingest.startup import Options, open_ingest
 from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.tasks import until_first_ends
+from bms_estimator.process.runtime import until_first_ends
 from bms_estimator.sources.captures.tables.layout import Column
 
 PACK_COLUMN = "pack"

@@ -25,13 +25,18 @@ from bms_estimator.model.sample import (
 )
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind, date_order
 from bms_estimator.sources.captures.tables.column_tables import parse_column
-from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, ColumnRole, Layout, Role, with_column_kinds
-from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
-from bms_estimator.sources.captures.tables.table_samples import (
+from bms_estimator.sources.captures.tables.layout import (
+    Column,
+    ColumnMap,
+    ColumnRole,
+    Layout,
+    Role,
     cell_voltages,
     remove_implausible_temperatures,
     to_samples,
+    with_column_kinds,
 )
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 from bms_estimator.sources.captures.tables.units import Unit, find_unit, split_unit
 
 MIN_TIME_S = 946_684_800.0

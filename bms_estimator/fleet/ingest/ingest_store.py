@@ -30,7 +30,7 @@ from bms_estimator.fleet.ingest.store_table import (
     read_state,
 )
 from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, last_sample_s
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 from bms_estimator.store.database import Database, StoreError
 
 RETRY_S = 1.0

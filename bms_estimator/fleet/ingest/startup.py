@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.streams import make_telemetry_stream, partitions_o
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.process.tasks import end, until_first_ends
+from bms_estimator.process.runtime import end, until_first_ends
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 NAME = "ingest"

@@ -29,7 +29,7 @@ from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import find_server, terminate_with_parent
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 from bms_estimator.settings.fleet import FleetSettings
 
 OTHER_FILES = 1000

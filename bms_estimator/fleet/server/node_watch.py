@@ -12,7 +12,7 @@ from bms_estimator.fleet.server.nats_config import Node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_config
 from bms_estimator.fleet.server.tenant_streams import makes_streams
 from bms_estimator.fleet.server.tenant_watch import TenantWatch
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 
 
 class NodeWatch:

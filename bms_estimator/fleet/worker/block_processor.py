@@ -28,8 +28,8 @@ from bms_estimator.fleet.worker.pack_state import (
     Fields,
     UnpackedRecord,
 )
+from bms_estimator.forecast.available_power import Forecast, unknown_values
 from bms_estimator.forecast.capability import write_usable_charge
-from bms_estimator.forecast.forecast import Forecast, unknown_values
 from bms_estimator.kernels.cells.records import BANK_STATE, CELL
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.clock import iso_utc

@@ -16,7 +16,7 @@ from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 
 log = structlog.get_logger(__name__)
 

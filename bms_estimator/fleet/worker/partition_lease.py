@@ -28,7 +28,7 @@ from bms_estimator.fleet.worker.partition_tasks import DeferredReader, TableChan
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer, RawMessages
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 from bms_estimator.fleet.worker.takeover import ReplayGuard, restore_partition
-from bms_estimator.process.tasks import until_first_ends
+from bms_estimator.process.runtime import until_first_ends
 
 IDLE_SILENCE_S = 5.0 * SILENCE_S
 """Interval between two searches while the stream has no further messages [s]."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.base.reading_protocol import DeviceProtocol
 from bms_estimator.protocols.base.sensor_correction import SensorCorrection
 
 BMS_GAIN_STD = 0.005

@@ -17,9 +17,9 @@ from bms_estimator.model.sample import (
 )
 from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.device_clock import DeviceClock
-from bms_estimator.protocols.base.device_protocol import DeviceProtocol, cell_block
 from bms_estimator.protocols.base.probe_check import ProbeCheck
 from bms_estimator.protocols.base.reading import Reading, read_line
+from bms_estimator.protocols.base.reading_protocol import DeviceProtocol, cell_block
 
 MAX_LINE_BYTES = 4096
 """Maximum length of a line [bytes]: 400 cells of seven characters fit. A longer line is noise."""

@@ -7,9 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import REST_C_RATE
-from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora
-from bms_estimator.calibration.ocv.points import max_v, pool_tests, rms_v
+from bms_estimator.calibration.cleaning.clean_capture import REST_C_RATE
+from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora, max_v, pool_tests, rms_v
 from bms_estimator.reports.formats import number
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.experiment import Experiment

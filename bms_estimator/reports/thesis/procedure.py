@@ -18,9 +18,8 @@ from functools import cached_property
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.rests import REST_C_RATE, remove_glitches, rest_current_a
-from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora
-from bms_estimator.calibration.ocv.points import pool_tests
+from bms_estimator.calibration.cleaning.clean_capture import REST_C_RATE, remove_glitches, rest_current_a
+from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, fit_chen_mora, pool_tests
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, relaxation_test
 from bms_estimator.calibration.ocv.table_fit import TableFit, fit_table
 from bms_estimator.calibration.thesis.adapt import printed_bounds

@@ -15,7 +15,7 @@ from typing import Any, get_args
 import structlog
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
+from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.settings.mqtt import Command
 
 COMMANDS = get_args(Command)

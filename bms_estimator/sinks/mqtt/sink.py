@@ -16,14 +16,20 @@ from typing import Self
 import structlog
 
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.mqtt.broker_config import brokers, check
-from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, Message, OnResult, ReceivedMessage
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.denied_topics import DeniedTopics
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
-from bms_estimator.mqtt.queue_sender import QueueSender
-from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.tasks import FIRST_DELAY_S, finish
+from bms_estimator.mqtt.connection import (
+    Connect,
+    Connection,
+    ConnectOptions,
+    DeliveryStats,
+    Message,
+    OnResult,
+    ReceivedMessage,
+    brokers,
+    check,
+)
+from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
+from bms_estimator.process.runtime import FIRST_DELAY_S, finish
 from bms_estimator.settings.alarms import ALARMS
 from bms_estimator.settings.mqtt import HomeAssistantSettings, MqttSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, MessageBuilder, PublishedState

@@ -13,7 +13,7 @@ from bms_estimator.sources.captures.replay import Capture, open_capture, read_sa
 from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, parse_number, uses_decimal_comma
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 from bms_estimator.sources.captures.tables.text_file import TextFile
-from bms_estimator.sources.captures.tables.text_format import (
+from bms_estimator.sources.captures.tables.text_table import (
     MAX_HEADER_CHARACTERS,
     MAX_HEADER_LINES,
     SEPARATORS,

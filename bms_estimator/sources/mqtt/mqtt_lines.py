@@ -11,7 +11,6 @@ import structlog
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.connection import (
     BrokerConnectionError,
     Connect,
@@ -19,8 +18,10 @@ from bms_estimator.mqtt.connection import (
     ConnectOptions,
     Message,
     ReceivedMessage,
+    brokers,
+    check,
 )
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.broker import BrokerSettings
 from bms_estimator.settings.pack import Settings

@@ -12,7 +12,7 @@ from threading import Thread
 
 import structlog
 
-from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.base.reading_protocol import DeviceProtocol
 from bms_estimator.sources.serial.known_board_file import NO_BOARD, STORED_FIELDS, KnownBoardFile
 from bms_estimator.sources.source import Chunk
 

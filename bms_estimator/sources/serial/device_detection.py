@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self, TypeVar
 
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.device_protocol import DeviceProtocol
+from bms_estimator.protocols.base.reading_protocol import DeviceProtocol
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.protocols.firmware.frame_decoder import FrameFault
 from bms_estimator.protocols.firmware.messages import BAUD, Hello, set_rate_command

@@ -12,8 +12,8 @@ import structlog
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.process.tasks import FIRST_RETRY_S
-from bms_estimator.protocols.base.device_protocol import Command, DeviceProtocol
+from bms_estimator.process.runtime import FIRST_RETRY_S
+from bms_estimator.protocols.base.reading_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings

@@ -11,7 +11,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
-from bms_estimator.forecast.forecast import NO_FORECAST, ForecastRows
+from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows
 from bms_estimator.kernels.alarms.records import CELLS, FAULTY_BOARD, LINK_LOST, NAMES
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
@@ -21,11 +21,16 @@ from bms_estimator.settings.alarm_limits import STATE_LOST, monitored_alarms, si
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.alarm_list import AlarmList
-from bms_estimator.telemetry.alarms.causes import find_unknown, time_left_text
-from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIES, SENSOR_SUSPECTS, AlarmDefinitions
+from bms_estimator.telemetry.alarms.causes import WRONG_CLOCK_TEXT, ProbeFaults, find_unknown, time_left_text
+from bms_estimator.telemetry.alarms.definitions import (
+    MODEL_SUSPECTS,
+    QUANTITIES,
+    SENSOR_SUSPECTS,
+    AlarmDefinitions,
+    decode,
+    encode,
+)
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.alarms.saved_state import decode, encode
-from bms_estimator.telemetry.alarms.sensor_faults import WRONG_CLOCK_TEXT, ProbeFaults
 from bms_estimator.telemetry.cells import CellAlarmInputs
 from bms_estimator.telemetry.health import suspicions
 

@@ -7,9 +7,8 @@ import numpy as np
 from rich.table import Table
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.forecast.available_power import cell_power_limits
+from bms_estimator.forecast.available_power import cell_power_limits, unknown_values
 from bms_estimator.forecast.capability import projected_pack, write_capability
-from bms_estimator.forecast.forecast import unknown_values
 from bms_estimator.forecast.load_history import LoadHistory
 from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.forecast.draws import DRAW

@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.calibration.ocv.points import pool_tests
+from bms_estimator.calibration.ocv.chen_mora_fit import pool_tests
 from bms_estimator.calibration.thesis.series_resistance import SeriesResistance, SeriesResistanceFit
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SampleBlock

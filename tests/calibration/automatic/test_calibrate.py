@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.automatic.calibrate import calibrate
-from bms_estimator.calibration.automatic.capacity_estimate import estimate_capacity
-from bms_estimator.calibration.automatic.hold_back import hold_back
-from bms_estimator.calibration.automatic.recognition import recognize
+from bms_estimator.calibration.automatic.model_fit import hold_back
+from bms_estimator.calibration.automatic.recognition import estimate_capacity, recognize
 from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.cli.cell.calibrate import remarks
 from bms_estimator.estimator.settings_records import ocv_grid

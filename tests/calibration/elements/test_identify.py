@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import gmean
 
-from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions
+from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, initial_soc
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
-from bms_estimator.calibration.cleaning.start_soc import initial_soc
 from bms_estimator.calibration.elements import identify as module
-from bms_estimator.calibration.elements import two_branch_fit
-from bms_estimator.calibration.elements.cell_from_fit import LADDER_STD
+from bms_estimator.calibration.elements.cell_from_fit import LADDER_STD, cell_file_sections
 from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
@@ -147,7 +145,7 @@ def test_the_two_rc_pairs_of_the_file_are_equivalent_to_its_ladder(identified):
 
 def test_capacitances_of_a_flat_ladder_are_positive_down_to_empty():
     flat = LADDER.model_copy(update={"weak_ohm": ((0.02,) * 3,) * 7, "strong_ohm": ((0.0,) * 3,) * 7})
-    sections = two_branch_fit.cell_file_sections(flat)
+    sections = cell_file_sections(flat)
     assert sections["r_s"].offset_ohm == pytest.approx(0.02, rel=1e-3)
     for name in ("c_ts", "c_tl"):
         assert 0.0 < sections[name].amplitude_farad < sections[name].offset_farad
@@ -158,7 +156,7 @@ def test_rc_pairs_that_a_slow_capture_does_not_determine_have_small_positive_res
     ladder_without_fast_pairs = LADDER.model_copy(
         update={"weak_ohm": tuple((0.0 if 0 < k < 4 else 0.02,) * 3 for k in range(7)), "strong_ohm": ((0.0,) * 3,) * 7}
     )
-    sections = two_branch_fit.cell_file_sections(ladder_without_fast_pairs)
+    sections = cell_file_sections(ladder_without_fast_pairs)
     assert 0.0 < sections["r_ts"].offset_ohm < 1e-3 * sections["r_tl"].offset_ohm
     assert 1.0 < sections["r_ts"].offset_ohm * sections["c_ts"].offset_farad < 30.0
 

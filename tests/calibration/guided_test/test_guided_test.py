@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.calibration.guided_test.guided_test import GuidedTest, Phase
 from bms_estimator.calibration.guided_test.plan import LONG, SHORT, Limits
-from bms_estimator.calibration.ocv.points import Points
+from bms_estimator.calibration.ocv.chen_mora_fit import Points
 from bms_estimator.calibration.ocv.table_fit import fit_table
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each

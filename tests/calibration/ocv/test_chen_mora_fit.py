@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora, fit_chen_mora
-from bms_estimator.calibration.ocv.points import Points, max_v, pool_tests, rms_v
+from bms_estimator.calibration.ocv.chen_mora_fit import (
+    Points,
+    average,
+    chen_mora,
+    fit_chen_mora,
+    max_v,
+    pool_tests,
+    rms_v,
+)
 from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
 from bms_estimator.calibration.ocv.table_fit import fit_table
 from bms_estimator.model.cell import load_cell

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
-from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora
-from bms_estimator.calibration.ocv.points import pool_tests
+from bms_estimator.calibration.cleaning.clean_capture import remove_glitches, soc_by_counting
+from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora, pool_tests
 from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
-from bms_estimator.calibration.ocv.points import Points, join_points, max_v, rms_v
+from bms_estimator.calibration.ocv.chen_mora_fit import Points, chen_mora, join_points, max_v, rms_v
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
 from bms_estimator.reports.thesis.printed_values import TABLE_1
 

@@ -16,7 +16,7 @@ from pyarrow import BufferOutputStream, parquet
 from pyarrow.csv import read_csv
 
 from bms_estimator import estimate, load_capture, load_cell
-from bms_estimator.forecast.forecast import FORECAST
+from bms_estimator.forecast.available_power import FORECAST
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 from bms_estimator.telemetry.state import NOT_IDENTIFIED

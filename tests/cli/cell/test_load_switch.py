@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.cli.cell.load_switch import LoadSwitch, relay_program
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 from tests.patience import until
 
 

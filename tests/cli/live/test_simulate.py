@@ -14,7 +14,7 @@ import pytest
 
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
-from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.pack_model import load_fuel_cell
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import set_rate_command, set_relay_command

@@ -8,8 +8,7 @@ import pytest
 
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.model.cell import load_cell
-from bms_estimator.process.instance_lock import instance_lock
-from bms_estimator.process.state_folder import state_folder
+from bms_estimator.process.state_folder import instance_lock, state_folder
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings, load_settings
 from tests.command_line import run

@@ -3,7 +3,7 @@
 import asyncio
 
 from bms_estimator.fleet.worker.block_loop import BlockLoop
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 
 
 class Messages:

@@ -12,7 +12,7 @@ from bms_estimator.cli.fleet import status as status_command
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.workers import OLD_HEARTBEAT

@@ -13,7 +13,7 @@ from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, pola
 from bms_estimator.kernels.observer import chen_mora_sensitivity
 from bms_estimator.kernels.observer.learning_model import NAMES, Model
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
-from bms_estimator.model.fuel_cell import load_fuel_cell
+from bms_estimator.model.pack_model import load_fuel_cell
 from tests import mann_stack
 
 PEM = load_fuel_cell("pem_30w")

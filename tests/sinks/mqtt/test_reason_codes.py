@@ -8,11 +8,9 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.mqtt.broker_config import brokers
-from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, DeliveryStats, brokers
 from bms_estimator.mqtt.queue_sender import WINDOW
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector
 from bms_estimator.settings.broker import BrokerSettings
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.sources.mqtt import SourceBroker

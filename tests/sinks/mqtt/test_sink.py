@@ -15,14 +15,11 @@ from aiomqtt import ProtocolVersion
 from bms_estimator.demo.demo import DemoBroker
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
-from bms_estimator.mqtt.broker_config import brokers, check
 from bms_estimator.mqtt.client import DEFAULT_TIMEOUTS, Client
-from bms_estimator.mqtt.connection import Connection, ConnectOptions, Message
-from bms_estimator.mqtt.delivery_stats import DeliveryStats
-from bms_estimator.mqtt.protocol_negotiation import BrokerConnector
+from bms_estimator.mqtt.connection import Connection, ConnectOptions, DeliveryStats, Message, brokers, check
 from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING, ReceiveQueue
-from bms_estimator.mqtt.reconnect_loop import ReconnectLoop
-from bms_estimator.process.tasks import MAX_DELAY_S
+from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
+from bms_estimator.process.runtime import MAX_DELAY_S
 from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import CORRECTION_S, MqttSink

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bms_estimator import load_capture
-from bms_estimator.calibration.cleaning.rests import remove_glitches, soc_by_counting
+from bms_estimator.calibration.cleaning.clean_capture import remove_glitches, soc_by_counting
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import open_capture
 from bms_estimator.sources.captures.tables.layout import Role

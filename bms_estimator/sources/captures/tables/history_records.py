@@ -10,7 +10,7 @@ from typing import NamedTuple
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder, shorten_cells
 from bms_estimator.sources.captures.tables.text_file import TextFile
-from bms_estimator.sources.captures.tables.text_format import (
+from bms_estimator.sources.captures.tables.text_table import (
     MAX_HEADER_CHARACTERS,
     MAX_HEADER_LINES,
     SEPARATORS,

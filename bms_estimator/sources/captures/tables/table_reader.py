@@ -14,26 +14,32 @@ from numpy.typing import NDArray
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
-from bms_estimator.sources.captures.tables.column_tables import ArrayTable, ColumnTable, ParquetTable
-from bms_estimator.sources.captures.tables.current_sign import StateWords, UserSign, find_direction, find_words
-from bms_estimator.sources.captures.tables.cycler_files import (
+from bms_estimator.sources.captures.tables.column_tables import (
     MPR_MAGIC,
     NDA_MAGIC,
     NDAX_MEMBER,
+    ArrayTable,
+    ColumnTable,
+    ParquetTable,
     read_biologic,
     read_neware,
 )
+from bms_estimator.sources.captures.tables.current_sign import StateWords, UserSign, find_direction, find_words
 from bms_estimator.sources.captures.tables.dialects import GENERIC, OWN
 from bms_estimator.sources.captures.tables.history_export import HistoryExport
 from bms_estimator.sources.captures.tables.history_records import open_records
-from bms_estimator.sources.captures.tables.layout import Column, ColumnMap, Layout, RawBlock, Role
-from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
-from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
-from bms_estimator.sources.captures.tables.table_samples import (
+from bms_estimator.sources.captures.tables.layout import (
+    Column,
+    ColumnMap,
+    Layout,
+    RawBlock,
+    Role,
     cell_voltages,
     remove_implausible_temperatures,
     to_samples,
 )
+from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
+from bms_estimator.sources.captures.tables.spreadsheet import Spreadsheet
 from bms_estimator.sources.captures.tables.text_file import ZIP_MAGIC
 from bms_estimator.sources.captures.tables.text_table import TextTable
 from bms_estimator.sources.captures.tables.time_base import ClockUnwrapper, find_time_base, is_descending
