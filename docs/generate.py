@@ -13,8 +13,7 @@ from bms_estimator.cli.fleet.commands import COMMANDS as FLEET_COMMANDS
 from bms_estimator.cli.main import COMMANDS
 from bms_estimator.fleet.metrics import families as fleet_definitions
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.health import Health
-from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.health import Health, Payload
 from bms_estimator.model.payloads.snapshot import Alarm, CellsReport, ForecastReport, Info, ParameterReport
 from bms_estimator.reports.thesis.report import build
 from bms_estimator.reports.thesis.report_items import Table

@@ -21,7 +21,7 @@ from bms_estimator.checkpoint.pack_description import PackDescription
 from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.private_file import overwrite_private, read_private, write_private
 from bms_estimator.process.state_folder import is_locked
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, new_totals
+from bms_estimator.telemetry.publish_window import ChargeEnergy, new_totals
 
 CHECKSUM_BYTES = 9
 """Length of the first line [bytes]."""

@@ -42,7 +42,16 @@ from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
-from bms_estimator.pack.state import CHECKPOINT, CURVES, HISTORY, LOAD, REFUSED, Arrays, DeclaredValues, PackState
+from bms_estimator.pack.state import (
+    CHECKPOINT,
+    CURVES,
+    HISTORY,
+    LOAD,
+    REFUSED,
+    Arrays,
+    DeclaredValues,
+    PackState,
+)
 from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
 from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.settings.pack import Settings

@@ -19,8 +19,7 @@ from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.mqtt import MqttSource
 from bms_estimator.sources.factory import open_source
-from bms_estimator.sources.serial.known_board_file import STORED_FIELDS, KnownBoardFile
-from bms_estimator.sources.serial.port_list import NoPortError, holder, resolve_port
+from bms_estimator.sources.serial.port_list import STORED_FIELDS, KnownBoardFile, NoPortError, holder, resolve_port
 
 NAME = "device"
 MIN_FIRST_SAMPLE_TIMEOUT_S = 8.0

@@ -29,7 +29,7 @@ from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, D
 from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import FIRST_DELAY_S, finish
-from bms_estimator.settings.exports import EdgeSettings
+from bms_estimator.settings.outputs import EdgeSettings
 from bms_estimator.store.database import RETRY_S, Database
 
 Times = NDArray[np.float64]

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.health import Payload
 
 HOUR_S = 3600
 """Length of an hour [s]."""

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml
+from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml, suggestion
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.one_of import suggestion
 
 Result = TypeVar("Result")
 """Result of ``CellModel.by_kind``."""

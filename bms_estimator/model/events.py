@@ -7,8 +7,7 @@ from typing import Literal, NamedTuple
 from pydantic import Field
 
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.payloads.health import AnchorReport, FitReport, Health
-from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.health import AnchorReport, FitReport, Health, Payload
 from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 
 MIN_UNSEEN_S = 1.0

@@ -1,4 +1,8 @@
-"""Model of a pack, a battery or a fuel cell stack, the only place that decides between them; and the writer of cell files."""
+"""Model of a pack, a battery or a fuel cell stack, the only place that decides between them; and the writer of cell files.
+
+The values of a fuel cell file describe ``series_count`` cells in series as one two-terminal object. ``FuelCellModel.pack`` scales them to
+several such stacks. A fuel cell has no capacity and no SOC.
+"""
 
 import math
 from collections.abc import Callable, Sequence

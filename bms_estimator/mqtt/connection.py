@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING
-from bms_estimator.process.systemd import credential_path
+from bms_estimator.process.runtime import credential_path
 from bms_estimator.settings.broker import BrokerSettings
 
 

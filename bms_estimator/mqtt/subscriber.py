@@ -20,7 +20,7 @@ from bms_estimator.mqtt.connection import (
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics, TopicCache
 from bms_estimator.process.runtime import FIRST_DELAY_S, finish
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import MqttSettings
 
 MAX_WAITING = 2000
 """Maximum number of messages that wait to be read. On subscription a broker sends all retained messages at once, about

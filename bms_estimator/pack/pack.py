@@ -9,10 +9,10 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import TraceBlock, compiled_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.estimator.restore import restore_state
+from bms_estimator.estimator.settings_plausibility import load_cutoff_v
 from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows, power_limits
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.load_history import restore_load
@@ -20,7 +20,6 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import NO_CELLS, NO_SOC, CellBlock, SampleBlock
-from bms_estimator.pack.declared_capacity import with_capacity
 from bms_estimator.pack.state import (
     CAPACITY,
     CELLS,
@@ -31,6 +30,7 @@ from bms_estimator.pack.state import (
     REFUSED,
     DeclaredValues,
     PackState,
+    with_capacity,
 )
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import use_fitted_curves

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator.history_rows import CHARGE, SEGMENT, TIME, checked_rows, is_within
+from bms_estimator.estimator.restore import CHARGE, SEGMENT, TIME, checked_rows, is_within
 from bms_estimator.kernels.pack_voltage import CURVE_NODES, DIRECTION_NODES
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.cell_curves import SOC_GRID

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.health import Payload
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.store.history import epoch_s

@@ -4,8 +4,17 @@ Each function draws on one ``Axes``, which it returns. Without ``ax`` it creates
 samples are thinned; the extremes stay visible.
 """
 
-from bms_estimator.plot.cell_curves import element, ocv, ocv_residuals, rc_product
-from bms_estimator.plot.time_series import current, soc, temperature, voltage, voltage_error
+from bms_estimator.plot.cell_curves import (
+    current,
+    element,
+    ocv,
+    ocv_residuals,
+    rc_product,
+    soc,
+    temperature,
+    voltage,
+    voltage_error,
+)
 
 __all__ = [
     "current",

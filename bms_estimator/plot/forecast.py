@@ -3,8 +3,8 @@
 from typing import Any
 
 from bms_estimator.forecast.available_power import ForecastCurve
+from bms_estimator.plot.cell_curves import label_axes, time_unit
 from bms_estimator.plot.style import COLORS, FAINT, MIN_SOC_SPAN_PERCENT, MIN_VOLTAGE_SPAN_V, draw_band, new_axes
-from bms_estimator.plot.time_series import label_axes, time_unit
 
 INTERVAL_LABEL = "90 % interval"
 """Text of the interval in the legend."""

@@ -8,7 +8,7 @@ import pkgutil
 from collections.abc import Mapping
 
 from bms_estimator.protocols import devices
-from bms_estimator.protocols.base.device import Device, Sensor
+from bms_estimator.protocols.base.polled_protocol import Device, Sensor
 from bms_estimator.protocols.base.reading_protocol import DeviceProtocol
 
 BOARD = "binary"

@@ -13,14 +13,15 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.plot.style import (
     COLORS,
     FAINT,
+    MAX_POINTS,
     MIN_CURRENT_SPAN_A,
     MIN_SOC_SPAN_PERCENT,
     MIN_TEMPERATURE_SPAN_K,
     MIN_VOLTAGE_SPAN_V,
     draw_band,
+    thin,
     widen,
 )
-from bms_estimator.plot.thinning import MAX_POINTS, thin
 from bms_estimator.reports.aging_group import AgingHistory, aging_group
 from bms_estimator.reports.formats import DAY_S, MINUTE_S, duration_text, number
 from bms_estimator.reports.report_page import Group, Plot, ReportPage, Section

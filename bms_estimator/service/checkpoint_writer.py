@@ -25,7 +25,7 @@ from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.service_status import ServiceStatus
 from bms_estimator.telemetry.alarms.definitions import INPUTS, PENDING, PROBES, SILENCE
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals
+from bms_estimator.telemetry.publish_window import ChargeEnergy, LifetimeTotals
 
 SOC_CHANGE = 0.002
 """Change of the SOC that triggers a save. If the service is killed, no larger change is lost."""

@@ -23,10 +23,9 @@ from bms_estimator.service.kernel_compilation import compile_kernels
 from bms_estimator.settings.alarm_limits import MIN_CELLS
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
+from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.publish_window import Window
-from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
+from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter, Window
 
 CELL = "chen_mora"
 """Cell file of the warm-up. Any file would do, because the kernels do not depend on the cell."""

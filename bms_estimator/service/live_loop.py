@@ -23,9 +23,8 @@ from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.process.daemon_thread import DaemonThreadExecutor
-from bms_estimator.process.runtime import acknowledge_on_signal, until_first_ends
+from bms_estimator.process.runtime import SystemdNotifier, acknowledge_on_signal, until_first_ends
 from bms_estimator.process.stderr_writer import stderr
-from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import CheckpointWriter
 from bms_estimator.service.publisher import Publisher
@@ -37,7 +36,7 @@ from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.serial.board_check import BoardCheck
 from bms_estimator.sources.source import Source
 from bms_estimator.telemetry.health import FitTimes
-from bms_estimator.telemetry.lifetime_totals import LifetimeTotals, new_totals
+from bms_estimator.telemetry.publish_window import LifetimeTotals, new_totals
 
 LOG_INTERVAL_S = 3600.0
 """Minimum interval between two log lines for each kind of exception [s]; all failures are counted."""

@@ -22,9 +22,8 @@ from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.health import RecordingHealth
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.page.page_sink import Pages, PageSink
-from bms_estimator.process.runtime import set_level, stop_on_signal
+from bms_estimator.process.runtime import SystemdNotifier, set_level, stop_on_signal
 from bms_estimator.process.state_folder import instance_lock, state_folder
-from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import has_relay
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
@@ -38,7 +37,7 @@ from bms_estimator.sinks.mqtt.venus_os import configured_limits
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.factory import open_device, pair_with_bms
-from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.port_list import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import ReadTap
 from bms_estimator.store.database import Database

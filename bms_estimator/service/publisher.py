@@ -18,7 +18,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.message import Change
-from bms_estimator.telemetry.cells import make_cells_payload
+from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload, remaining_capacity_ah
 from bms_estimator.telemetry.health import (
     contradicts_device,
     dropped_text,
@@ -27,9 +27,15 @@ from bms_estimator.telemetry.health import (
     pack_model_health,
     sample_counters,
 )
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, LifetimeTotals, new_totals
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.publish_window import RestDetector, Window, WindowSummary
+from bms_estimator.telemetry.publish_window import (
+    ChargeEnergy,
+    LifetimeTotals,
+    RestDetector,
+    Window,
+    WindowSummary,
+    new_totals,
+)
 from bms_estimator.telemetry.state import (
     finite,
     make_forecast_payload,
@@ -37,7 +43,6 @@ from bms_estimator.telemetry.state import (
     make_state_payload,
     no_forecast,
 )
-from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 
 log = structlog.get_logger(__name__)
 

@@ -8,7 +8,7 @@ from bms_estimator.model.payloads.health import EdgeHealth, HookHealth, Recordin
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.sources.source import SourceHealth
 from bms_estimator.telemetry.health import NO_FIT, FitTimes
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
+from bms_estimator.telemetry.publish_window import ChargeEnergy
 
 MIN_LATENCY_S = 1e-5
 """Upper edge of the first bin [s]."""

@@ -6,8 +6,8 @@ from typing import Annotated, Self
 from pydantic import AwareDatetime, Field, model_validator
 
 from bms_estimator.model.config_file import Strict
+from bms_estimator.settings.outputs import Address, ListenAddress, parse_listen
 from bms_estimator.settings.pack import DeviceName
-from bms_estimator.settings.page import Address, ListenAddress, parse_listen
 
 Gigabytes = Annotated[float, Field(gt=0, le=1e6)]
 PackCount = Annotated[int, Field(ge=1, le=10_000_000)]

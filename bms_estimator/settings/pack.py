@@ -10,16 +10,20 @@ from bms_estimator.model.config_file import Fraction, Positive, Strict, read_tom
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.registry import max_batteries
 from bms_estimator.settings.alarms import AlarmSettings
-from bms_estimator.settings.exports import EdgeSettings, InfluxSettings, PrometheusSettings
-from bms_estimator.settings.mqtt import HomeAssistantSettings, MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from bms_estimator.settings.page import PageSettings
+from bms_estimator.settings.outputs import (
+    EdgeSettings,
+    HomeAssistantSettings,
+    InfluxSettings,
+    MqttSettings,
+    PageSettings,
+    PrometheusSettings,
+)
 from bms_estimator.settings.sampling import ChargeLimits, Sampling
 from bms_estimator.settings.sensor import ALLOWED_WITH_SOURCE, SensorSettings
 from bms_estimator.settings.sources.ble import BleSource
-from bms_estimator.settings.sources.can import CanSource
+from bms_estimator.settings.sources.fieldbus import CanSource, ModbusSource
 from bms_estimator.settings.sources.linux import LinuxSource
-from bms_estimator.settings.sources.modbus import ModbusSource
 from bms_estimator.settings.sources.mqtt import MqttSource
 
 SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]

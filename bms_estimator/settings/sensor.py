@@ -4,8 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
-from bms_estimator.model.config_file import NotNegative, Positive, Strict
-from bms_estimator.model.one_of import OneOf
+from bms_estimator.model.config_file import NotNegative, OneOf, Positive, Strict
 from bms_estimator.protocols.base.sensor_correction import SensorCorrection
 from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS, max_batteries, valid_addresses
 from bms_estimator.settings.sampling import BOARD_GAIN_STD

@@ -11,9 +11,9 @@ from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, LoginError, brokers, check
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.settings.sources.modbus import PROFILES as MODBUS_PROFILES
+from bms_estimator.settings.sources.fieldbus import MODBUS_PROFILES
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import NAME_SEPARATOR, FoundDevice, with_pairs
 from bms_estimator.setup.measurement import measure

@@ -7,11 +7,10 @@ import importlib
 from collections.abc import Mapping
 
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.line_source import LineProducer, LineSource
 from bms_estimator.sources.paired_source import DeviceSource, PairedSource
-from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.port_list import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
-from bms_estimator.sources.source import ReadTap
+from bms_estimator.sources.source import LineProducer, LineSource, ReadTap
 
 KINDS: Mapping[str, str] = {
     "mqtt": "mqtt.mqtt_lines",

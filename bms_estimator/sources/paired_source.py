@@ -10,9 +10,8 @@ import numpy as np
 
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.sample import NO_SOC, SampleStatus
-from bms_estimator.sources.line_source import LineSource
 from bms_estimator.sources.serial.serial_source import SerialSource
-from bms_estimator.sources.source import ReceivedSamples
+from bms_estimator.sources.source import LineSource, ReceivedSamples
 
 TEMPERATURES = "temperature_c", "temperature_min_c", "temperature_max_c"
 """Fields of a sample with temperatures."""

@@ -14,12 +14,11 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
+from bms_estimator.model.payloads.health import PAYLOAD_VERSION
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info
 from bms_estimator.model.sample import ProbeBlock
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
-from bms_estimator.telemetry.publish_window import WindowSummary
+from bms_estimator.telemetry.publish_window import ChargeEnergy, WindowSummary
 from bms_estimator.version import __version__
 
 MIN_SHOWN_MEDIAN_S = 600.0

@@ -15,7 +15,7 @@ from bms_estimator.edge import block
 from bms_estimator.fleet.worker.checkpoint import checkpoint_format
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.cells.records import BANK_STATE, CELL
-from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
+from bms_estimator.model.payloads.health import PAYLOAD_VERSION
 
 
 def test_formats_have_their_numbers() -> None:

@@ -16,7 +16,7 @@ from bms_estimator.process.state_folder import instance_lock
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.port_list import KnownBoardFile
 from tests.device_line import running_device
 from tests.doctor.as_user import as_nobody
 from tests.doctor.packs import subject

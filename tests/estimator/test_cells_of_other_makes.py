@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator import Estimator, load_capture, load_cell
-from bms_estimator.protocols.base.device import BMS_GAIN_STD
+from bms_estimator.protocols.base.polled_protocol import BMS_GAIN_STD
 from bms_estimator.settings.sampling import Sampling
 from tests.estimator.anywhere.score import score
 

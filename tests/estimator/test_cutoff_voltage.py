@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
+from bms_estimator.estimator.settings_plausibility import load_cutoff_v
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import Settings

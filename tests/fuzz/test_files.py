@@ -20,7 +20,7 @@ from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.raw_capture import MAGIC
 from bms_estimator.sources.captures.replay import load_capture
-from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.port_list import KnownBoardFile
 from tests.fuzz.edited_seeds import SEEDS, edit, edited_seeds
 
 TOML_TOKENS = (

@@ -13,8 +13,7 @@ from serial.tools.list_ports_common import ListPortInfo
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.mqtt.topic_cache import TopicCache
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher, number
-from bms_estimator.sinks.terminal.screen import build_screen
-from bms_estimator.sinks.terminal.sink import text_line
+from bms_estimator.sinks.terminal.sink import build_screen, text_line
 from bms_estimator.sinks.terminal.view_state import PackView, ViewState
 from bms_estimator.sources.serial.port_list import NoPortError, may_be_board, resolve_port
 from tests.fuzz.edited_seeds import edited_seeds

@@ -17,7 +17,7 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.lifetime_totals import LifetimeTotals
+from bms_estimator.telemetry.publish_window import LifetimeTotals
 from tests.fuzz.edited_seeds import edit
 from tests.scripted_source import ScriptedSource
 

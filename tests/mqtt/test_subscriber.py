@@ -11,7 +11,7 @@ import structlog
 
 from bms_estimator.mqtt.subscriber import MAX_BYTES, Subscriber
 from bms_estimator.mqtt.topic_cache import DeviceMessage
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import MqttSettings
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S, until

@@ -8,8 +8,8 @@ import pytest
 from aiohttp import ClientSession
 from playwright.async_api import Page, expect
 
+from bms_estimator.settings.outputs import PageSettings
 from bms_estimator.settings.pack import load_settings
-from bms_estimator.settings.page import PageSettings
 from bms_estimator.setup.page.setup_server import SetupServer
 from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.plot.thinning import thin
+from bms_estimator.plot.style import thin
 
 
 def test_extremes_of_every_curve_stay_in_5_million_samples():

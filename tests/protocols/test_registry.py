@@ -13,7 +13,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from tests.patience import LONG_S
 
 SHUNT_MODULE = """
-from bms_estimator.protocols.base.device import Device, SensorDefaults
+from bms_estimator.protocols.base.polled_protocol import Device, SensorDefaults
 from bms_estimator.protocols.devices.text import TextProtocol
 
 DEVICE = Device(

@@ -26,7 +26,7 @@ from bms_estimator.settings.alarms import AlarmHook
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
-from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
+from bms_estimator.sources.serial.port_list import NO_BOARD, KnownBoardFile
 from bms_estimator.telemetry.alarms.message import Change
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S

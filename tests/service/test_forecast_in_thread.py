@@ -16,7 +16,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.service import forecast_request
-from bms_estimator.service.forecast_request import forecast_data, forecast_in_thread
+from bms_estimator.service.request_handlers import forecast_data, forecast_in_thread
 
 SAMPLES = np.zeros(800, SAMPLE)
 SAMPLES["time_s"], SAMPLES["temperature_c"] = np.arange(SAMPLES.size), 25.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.service.forecast_request import requested_trip
+from bms_estimator.service.request_handlers import requested_trip
 
 
 def test_constant_load_is_read_with_its_duration() -> None:

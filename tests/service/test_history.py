@@ -20,7 +20,7 @@ from bms_estimator.process.boot_clock import BootTimestamp
 from bms_estimator.service import checkpoint_writer
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, gap_lengths
+from bms_estimator.telemetry.publish_window import ChargeEnergy, gap_lengths
 from tests.checkpoint.test_checkpoint import (
     CELL,
     SETTINGS,

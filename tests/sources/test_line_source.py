@@ -16,8 +16,7 @@ from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.captures.replay import RawCapture
 from bms_estimator.sources.fault_log import FaultLog
-from bms_estimator.sources.line_source import LineProducer, LineSource, SourceUnavailableError
-from bms_estimator.sources.source import ReceivedSamples
+from bms_estimator.sources.source import LineProducer, LineSource, ReceivedSamples, SourceUnavailableError
 from tests.patience import LONG_S
 
 TEXT = SensorSettings(protocol="text")

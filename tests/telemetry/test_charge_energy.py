@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
+from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter
 
 GAP_S = 5.0
 """Time between samples above which they have a gap [s]."""

@@ -12,9 +12,9 @@ from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings
+from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.health import identifier_counters, suspicions
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.weakest_cell import remaining_capacity_ah
 from tests.estimator.anywhere.cases import Case, capture
 
 CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})

@@ -9,7 +9,7 @@ from pydantic_core import from_json
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.protocols.firmware.messages import DELIMITER, PROTOCOL_VERSION, MessageType, ProtocolError, unseal
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
+from bms_estimator.telemetry.publish_window import ChargeEnergy
 from tests.world.broker import Connection, Packet
 
 MAX_STDS = 4.0

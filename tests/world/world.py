@@ -20,14 +20,14 @@ from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.pack.state import REFUSED, PackState
 from bms_estimator.service import pack_service as service
-from bms_estimator.settings.mqtt import MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings
+from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings, StateSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts
 from bms_estimator.sources import factory
 from bms_estimator.sources.serial.board_check import MAX_PENDING_READS, BoardCheck
-from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.port_list import KnownBoardFile
 from tests.world import invariants
 from tests.world.broker import Broker, Connection, Packet
 from tests.world.disk import Disk, PowerCutError

@@ -9,8 +9,7 @@ from bms_estimator.calibration.automatic.recognition import CapacityEstimate, Re
 from bms_estimator.calibration.cleaning.capture_checks import StartOrigin
 from bms_estimator.calibration.cleaning.capture_checks import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
-from bms_estimator.calibration.elements.identification import Identification
-from bms_estimator.calibration.elements.identify import identify
+from bms_estimator.calibration.elements.identify import Identification, identify
 from bms_estimator.calibration.elements.ladder_fit import MIN_SPAN_K
 from bms_estimator.calibration.ocv.hysteresis import ExternalCurve, Recording
 from bms_estimator.calibration.ocv_cell import OcvCell, determine_ocv

@@ -7,7 +7,7 @@ scored, because a fit without the only drive, or the only HPPC, extrapolates.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 
@@ -24,11 +24,10 @@ from bms_estimator.calibration.elements.cell_from_fit import (
     MIN_RMS_SOC,
     SECTIONS,
     cell_from_fit,
+    interval_score,
     ladder_prior,
     voltage_rms_v,
 )
-from bms_estimator.calibration.elements.identification import CaptureFit, Identification
-from bms_estimator.calibration.elements.ladder_columns import correction_at
 from bms_estimator.calibration.elements.ladder_fit import (
     MIN_SPAN_K,
     LadderFit,
@@ -39,8 +38,7 @@ from bms_estimator.calibration.elements.ladder_fit import (
     temperature_contradictions,
     temperature_range,
 )
-from bms_estimator.calibration.elements.normal_equations import NormalEquations, normal_equations
-from bms_estimator.calibration.elements.replay_score import interval_score
+from bms_estimator.calibration.elements.normal_equations import NormalEquations, correction_at, normal_equations
 from bms_estimator.calibration.ocv.overpotential import ocv_offset
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.model.arrays import Floats
@@ -48,6 +46,63 @@ from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress, WorkCounter, no_progress
+
+
+@dataclass(frozen=True)
+class CaptureFit:
+    """Result of the fit for one capture.
+
+    Attributes:
+        name: Name of the capture.
+        samples: Number of samples in the capture.
+        glitches: Number of dropped glitches.
+        initial_soc: SOC at the first sample, 0..1.
+        temperature_c: Lowest and highest temperature [C]; None without a sensor.
+        miscount: Relative error of the counted charge. The SOC of the fit is corrected by it.
+        voltage_rms_v: RMS residual of the voltage, weighted by time, at SOC above 0.1 [V].
+        score_before: Interval score of replays with the given cell [%]; NaN when the capture is too short.
+        score_after: Interval score with the identified cell [%].
+        held_back: True if ``score_after`` is of a cell that was fitted without this capture.
+    """
+
+    name: str
+    samples: int
+    glitches: int
+    initial_soc: float
+    temperature_c: tuple[float, float] | None
+    miscount: float
+    voltage_rms_v: float
+    score_before: float
+    score_after: float
+    held_back: bool
+
+
+@dataclass(frozen=True)
+class Identification:
+    """An identified cell.
+
+    Attributes:
+        cell: The cell with its ladder, the elements of two RC pairs, and a corrected OCV if that improves the replays.
+        elements: Value and standard error of ``r_s``, ``r_ts`` and ``r_tl`` at 25 C by SOC and name [ohm].
+        captures: Fit of each capture, in the order given.
+        left_out: Names of captures without excitation.
+        ocv_correction_v: RMS of the change of the open-circuit voltage over SOC 0.1..1 [V]; 0 if the given OCV is used.
+        score_before: Geometric mean of the captures' interval scores with the given cell [%]; NaN when none has a
+            score.
+        score_after: Geometric mean of the interval scores with the identified cell [%].
+        undetermined_starts: Lines on captures whose SOC at the first sample was not given, and whose first voltage allows a wide
+            range of SOC.
+    """
+
+    cell: CellModel
+    elements: dict[float, dict[str, tuple[float, float]]]
+    captures: tuple[CaptureFit, ...]
+    left_out: tuple[str, ...]
+    ocv_correction_v: float
+    score_before: float
+    score_after: float
+    undetermined_starts: tuple[str, ...] = ()
+
 
 REPORTED_SOC = (0.2, 0.5, 0.8)
 """SOCs at which the resistances are reported."""

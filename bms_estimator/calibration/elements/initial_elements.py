@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from bms_estimator.calibration.cleaning.clean_capture import remove_glitches
-from bms_estimator.calibration.cleaning.mismatched_steps import are_mismatched
+from bms_estimator.calibration.cleaning.clean_capture import are_mismatched, remove_glitches
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
 from bms_estimator.model.cell import Capacitance, Resistance
 from bms_estimator.model.errors import UserError

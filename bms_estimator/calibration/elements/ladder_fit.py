@@ -11,15 +11,15 @@ from scipy.optimize import lsq_linear
 
 from bms_estimator.calibration.cleaning.capture_checks import initial_soc
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
-from bms_estimator.calibration.elements.ladder_columns import (
+from bms_estimator.calibration.elements.normal_equations import (
     KELVIN_NODES,
     PART_SIZE,
     SOC_NODES,
     SPLINES,
     UNBOUNDED,
+    NormalEquations,
     correction_at,
 )
-from bms_estimator.calibration.elements.normal_equations import NormalEquations
 from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix, temperature_of
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C, RESISTANCES

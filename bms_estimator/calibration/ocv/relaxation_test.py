@@ -17,8 +17,8 @@ from bms_estimator.calibration.cleaning.clean_capture import (
     resting_samples,
     soc_by_counting,
     true_runs,
+    with_matched_voltages,
 )
-from bms_estimator.calibration.cleaning.mismatched_steps import with_matched_voltages
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleBlock

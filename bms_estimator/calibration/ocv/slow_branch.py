@@ -8,8 +8,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from bms_estimator.calibration.cleaning.capture_checks import StartOrigin, StartSoc
-from bms_estimator.calibration.cleaning.clean_capture import mean_temperature_c, resting_samples, true_runs
-from bms_estimator.calibration.cleaning.mismatched_steps import with_matched_voltages
+from bms_estimator.calibration.cleaning.clean_capture import (
+    mean_temperature_c,
+    resting_samples,
+    true_runs,
+    with_matched_voltages,
+)
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.charge_count import are_long_gaps, charge_ah
 from bms_estimator.model.errors import UserError

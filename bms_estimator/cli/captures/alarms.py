@@ -25,9 +25,8 @@ from bms_estimator.cli.options.capture_options import (
     complete_cell,
     print_guesses,
 )
-from bms_estimator.cli.options.compile_progress import compile_ahead, progress_bar
+from bms_estimator.cli.options.output import compile_ahead, progress_bar, silenced_log
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
-from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.pack_model import PackModel

@@ -32,7 +32,7 @@ from bms_estimator.cli.options.capture_options import (
     complete_cell,
     print_guesses,
 )
-from bms_estimator.cli.options.compile_progress import compile_ahead, progress_bar
+from bms_estimator.cli.options.output import compile_ahead, progress_bar
 from bms_estimator.cli.options.pack_options import (
     decimal,
     pack_or_cell,

@@ -22,7 +22,7 @@ from bms_estimator.cli.options.capture_options import (
     name_of,
     reject_duplicates,
 )
-from bms_estimator.cli.options.compile_progress import progress_bar
+from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.cli.options.pack_options import LABORATORY_RESOLUTION_V, decimal
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError

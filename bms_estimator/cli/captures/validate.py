@@ -26,7 +26,7 @@ from bms_estimator.cli.options.capture_options import (
     check_output_file,
     load_captures,
 )
-from bms_estimator.cli.options.compile_progress import compile_ahead, progress_bar
+from bms_estimator.cli.options.output import compile_ahead, progress_bar
 from bms_estimator.cli.options.pack_options import decimal, pack_or_cell, with_pack
 from bms_estimator.model.arrays import Records, structured_array
 from bms_estimator.model.sample import fill_temperature

@@ -38,7 +38,7 @@ from bms_estimator.cli.options.capture_options import (
     name_of,
     reject_duplicates,
 )
-from bms_estimator.cli.options.compile_progress import progress_bar
+from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.cli.options.pack_options import decimal, whole
 from bms_estimator.model.cell import fitted_to
 from bms_estimator.model.config_file import write_text

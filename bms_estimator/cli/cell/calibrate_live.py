@@ -29,9 +29,9 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 from bms_estimator.sources.factory import open_device
-from bms_estimator.sources.line_source import LineSource
 from bms_estimator.sources.serial.port_list import NoPortError, PortBusyError, open_port, resolve_port
 from bms_estimator.sources.serial.serial_source import SerialSource
+from bms_estimator.sources.source import LineSource
 
 CUTOFF_MARGIN_V = 0.02
 """Distance per cell between the limits of the test and the alarms, and between mean and single cells without alarms [V]."""

@@ -12,8 +12,7 @@ from rich import box
 from rich.console import Console, Group
 from rich.table import Table
 
-from bms_estimator.calibration.elements.identification import CaptureFit, Identification
-from bms_estimator.calibration.elements.identify import identify
+from bms_estimator.calibration.elements.identify import CaptureFit, Identification, identify
 from bms_estimator.cli.cell.identify_fuel_cell import identify_fuel_cell
 from bms_estimator.cli.options.capture_options import (
     CELL_OR_FUEL_CELL_HELP,
@@ -32,7 +31,7 @@ from bms_estimator.cli.options.capture_options import (
     reject_duplicates,
     write_cell_named_as_file,
 )
-from bms_estimator.cli.options.compile_progress import progress_bar
+from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.model.cell import is_fuel_cell, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.telemetry.state import finite

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import TypeAdapter, ValidationError
 
-from bms_estimator.cli.options.table import count_text
+from bms_estimator.cli.options.output import count_text
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts
@@ -20,8 +20,8 @@ from bms_estimator.model.config_file import error_reason, read_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.settings.fleet import FleetSettings
+from bms_estimator.settings.outputs import parse_listen
 from bms_estimator.settings.pack import DeviceName
-from bms_estimator.settings.page import parse_listen
 
 SettingsFile = Annotated[
     Path | None,

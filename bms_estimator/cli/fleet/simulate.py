@@ -18,7 +18,7 @@ from bms_estimator.model.config_file import without_secrets, write_text
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.connection import check as check_broker_settings
 from bms_estimator.process.runtime import stop_on_signal
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import DeviceName
 
 PAST_BLOCKS = 30 * 24 * 60

@@ -5,8 +5,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.pack_options import decimal, whole
-from bms_estimator.cli.options.page_options import complete_port
+from bms_estimator.cli.options.pack_options import complete_port, decimal, whole
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.protocols.firmware.messages import (
@@ -27,8 +26,7 @@ from bms_estimator.protocols.firmware.messages import (
 )
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.serial.device_detection import BoardClient
-from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
-from bms_estimator.sources.serial.port_list import NoPortError, resolve_port
+from bms_estimator.sources.serial.port_list import NO_BOARD, KnownBoardFile, NoPortError, resolve_port
 
 
 def board(

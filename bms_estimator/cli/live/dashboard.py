@@ -6,14 +6,12 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.pack_options import with_broker
-from bms_estimator.cli.options.page_options import Browser, TokenFile, page_settings, serve
+from bms_estimator.cli.options.pack_options import Browser, TokenFile, page_settings, serve, with_broker
 from bms_estimator.page.broker_page import dashboard as broker_page
 from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import DEFAULT_LISTEN, MqttSettings, PageSettings
 from bms_estimator.settings.pack import Settings, load_settings
-from bms_estimator.settings.page import DEFAULT_LISTEN, PageSettings
 
 
 def dashboard(

@@ -7,13 +7,12 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.compile_progress import compile_ahead
-from bms_estimator.cli.options.pack_options import decimal, whole
-from bms_estimator.cli.options.page_options import open_browser
+from bms_estimator.cli.options.output import compile_ahead
+from bms_estimator.cli.options.pack_options import decimal, open_browser, whole
 from bms_estimator.demo.demo import run_demo
 from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
-from bms_estimator.sinks.terminal.screen import LOG_LINES
+from bms_estimator.sinks.terminal.sink import LOG_LINES
 
 
 def demo(

@@ -10,11 +10,11 @@ from typing import Annotated
 import structlog
 import typer
 
-from bms_estimator.cli.options.pack_options import with_sensor
-from bms_estimator.cli.options.page_options import PortOverride
+from bms_estimator.cli.options.pack_options import PortOverride, with_sensor
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import (
+    SystemdNotifier,
     configure_logs,
     exit_on_startup_signals,
     flush_logs,
@@ -23,13 +23,11 @@ from bms_estimator.process.runtime import (
     until_first_ends,
 )
 from bms_estimator.process.state_folder import instance_lock, state_folder
-from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.factory import open_device, pair_with_bms
-from bms_estimator.sources.line_source import LineSource
-from bms_estimator.sources.serial.known_board_file import KnownBoardFile
+from bms_estimator.sources.serial.port_list import KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
-from bms_estimator.sources.source import Source
+from bms_estimator.sources.source import LineSource, Source
 
 SOURCE_HUNG_S = 30.0
 """Time after which a source whose task has not run counts as hung [s]."""

@@ -27,7 +27,7 @@ from bms_estimator.cli.options.capture_options import (
     long_file_bar,
     print_guesses,
 )
-from bms_estimator.cli.options.compile_progress import compile_ahead
+from bms_estimator.cli.options.output import compile_ahead
 from bms_estimator.cli.options.pack_options import decimal, pack_or_cell, with_pack
 from bms_estimator.forecast.available_power import Forecast, ForecastCurve
 from bms_estimator.forecast.trip import MAX_LOAD, MAX_TRIP_S, Trip, TripOutcome, constant_trip, trip_outcome
@@ -37,7 +37,7 @@ from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.reports.formats import duration_text, number
-from bms_estimator.service.forecast_request import as_json_data
+from bms_estimator.service.request_handlers import as_json_data
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import open_capture
 from bms_estimator.sources.captures.trip_file import read_trip

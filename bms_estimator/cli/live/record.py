@@ -11,8 +11,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from bms_estimator.cli.options.pack_options import decimal, load_pack, whole, with_sensor
-from bms_estimator.cli.options.page_options import PortOverride
+from bms_estimator.cli.options.pack_options import PortOverride, decimal, load_pack, whole, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import configure_logs, flush_logs, stop_on_signal, until_first_ends
 from bms_estimator.settings.pack import Settings

@@ -12,9 +12,8 @@ from typing import Annotated
 import structlog
 import typer
 
-from bms_estimator.cli.options.compile_progress import compile_ahead
-from bms_estimator.cli.options.pack_options import load_pack, with_broker, with_sensor
-from bms_estimator.cli.options.page_options import PortOverride
+from bms_estimator.cli.options.output import compile_ahead
+from bms_estimator.cli.options.pack_options import PortOverride, load_pack, with_broker, with_sensor
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.runtime import configure_logs, exit_on_startup_signals, flush_logs
@@ -22,8 +21,7 @@ from bms_estimator.process.state_folder import state_folder
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.service.pack_service import run_pack_service, run_pack_services
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sinks.terminal.screen import LOG_LINES
-from bms_estimator.sinks.terminal.sink import TerminalSink
+from bms_estimator.sinks.terminal.sink import LOG_LINES, TerminalSink
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder
 

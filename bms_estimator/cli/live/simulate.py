@@ -10,12 +10,11 @@ import typer
 from bms_estimator.cli.options.capture_options import CELL_OR_FUEL_CELL_HELP, CapacityAh, complete_cell
 from bms_estimator.cli.options.pack_options import decimal, whole
 from bms_estimator.model.cell import Cell, is_fuel_cell, load_cell
-from bms_estimator.model.config_file import without_secrets
+from bms_estimator.model.config_file import suggestion, without_secrets
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.one_of import suggestion
 from bms_estimator.model.pack_model import load_fuel_cell
 from bms_estimator.process.runtime import configure_logs, stop_on_signal, until_first_ends
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.simulation.bms_responses import BMS_RESPONSES
 from bms_estimator.simulation.esphome_node import SimulatedNode

@@ -1,4 +1,7 @@
-"""Captures as arguments of a command, and checks of the files that it writes."""
+"""Captures as arguments of a command, and checks of the files that it writes.
+
+Standard input is copied to a file, because readers need the size of a file and read it twice.
+"""
 
 import filecmp
 import shutil
@@ -11,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.compile_progress import progress_bar
+from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.cli.options.pack_options import decimal, whole
 from bms_estimator.model.cell import CellModel, battery_names, cell_names, fitted_to, with_name
 from bms_estimator.model.charge_count import TimeFaults, gap_warnings

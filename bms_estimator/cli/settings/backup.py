@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.installation import paths
-from bms_estimator.installation.pack_files import named_files
+from bms_estimator.installation.program_copy import named_files
 from bms_estimator.model.config_file import parse_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.private_file import write_private

@@ -7,7 +7,7 @@ import tomlkit
 import typer
 
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
+from bms_estimator.estimator.settings_plausibility import load_cutoff_v
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import CellModel, load_cell

@@ -19,8 +19,13 @@ from bms_estimator.installation.install import (
     uninstall,
 )
 from bms_estimator.installation.machine import Machine
-from bms_estimator.installation.pack_files import is_hidden_from_services, named_files
-from bms_estimator.installation.program_copy import copy_program, is_program_copy, system_python
+from bms_estimator.installation.program_copy import (
+    copy_program,
+    is_hidden_from_services,
+    is_program_copy,
+    named_files,
+    system_python,
+)
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.version import __version__

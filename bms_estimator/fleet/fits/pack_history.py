@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator.history_rows import checked_rows
+from bms_estimator.estimator.restore import checked_rows
 from bms_estimator.fleet.fits.messages import (
     FitRequest,
     FitResult,

@@ -23,7 +23,7 @@ from bms_estimator.model.sample import (
     SampleBlock,
     remove_implausible,
 )
-from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind, date_order
+from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind, Unit, date_order, find_unit, split_unit
 from bms_estimator.sources.captures.tables.column_tables import parse_column
 from bms_estimator.sources.captures.tables.layout import (
     Column,
@@ -37,7 +37,6 @@ from bms_estimator.sources.captures.tables.layout import (
     with_column_kinds,
 )
 from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
-from bms_estimator.sources.captures.tables.units import Unit, find_unit, split_unit
 
 MIN_TIME_S = 946_684_800.0
 """Earliest plausible timestamp: 2000-01-01 [s since 1970]."""

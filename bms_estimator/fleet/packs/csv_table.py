@@ -14,9 +14,8 @@ from typing import NamedTuple
 from pydantic import ValidationError
 
 from bms_estimator.fleet.packs.pack_row import COLUMNS, PackSpec, encode_row, model_key, model_of, shipped_cell_names
-from bms_estimator.model.config_file import error_reason
+from bms_estimator.model.config_file import error_reason, suggestion
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.one_of import suggestion
 from bms_estimator.settings.pack import DEVICE_NAME
 
 MAX_ERRORS = 20

@@ -16,9 +16,8 @@ from bms_estimator.model.cell import (
     shipped_fuel_cells,
     with_capacity,
 )
-from bms_estimator.model.config_file import NotNegative, Positive, Strict, error_reason, parse_toml
+from bms_estimator.model.config_file import NotNegative, OneOf, Positive, Strict, error_reason, parse_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.one_of import OneOf
 from bms_estimator.model.pack_model import FuelCellModel, PackModel, load_model
 from bms_estimator.protocols.registry import DEVICES
 from bms_estimator.settings.observer import IdentifierSettings, IdentifierValues

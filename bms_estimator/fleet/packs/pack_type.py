@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from bms_estimator.checkpoint.arrays_file import pack_identity
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.cutoff_voltage import load_cutoff_v
 from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.estimator.settings_plausibility import load_cutoff_v
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, assemble
@@ -23,7 +23,7 @@ from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sampling import NO_LIMITS
 from bms_estimator.telemetry.alarms.definitions import AlarmDefinitions
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy, ChargeEnergyMeter
+from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter
 
 MAX_TYPES = 256
 """Maximum number of cached types. Creating a type that is not cached takes 50 ms."""

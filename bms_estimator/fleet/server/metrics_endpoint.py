@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from bms_estimator.fleet.server.nats_config import Node
 from bms_estimator.fleet.server.node_watch import NodeWatch
-from bms_estimator.settings.page import parse_listen
+from bms_estimator.settings.outputs import parse_listen
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric

@@ -20,7 +20,7 @@ from bms_estimator.edge.subjects import BlockRequest, block_request, raw
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.mqtt.connection import brokers, password, tls_context
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import MqttSettings
 
 POLL_S = 0.1
 """Interval between two checks for due blocks [s]."""

@@ -33,15 +33,13 @@ from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.kernels.cells.records import BANK_STATE, CELL
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.health import Payload
 from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.pack.state import CHECKPOINT, REFUSED, PackState
-from bms_estimator.telemetry.cells import make_cells_payload
-from bms_estimator.telemetry.lifetime_totals import ChargeEnergy
+from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload, remaining_capacity_ah
 from bms_estimator.telemetry.parameters import make_parameters_payload
-from bms_estimator.telemetry.publish_window import Window
+from bms_estimator.telemetry.publish_window import ChargeEnergy, Window
 from bms_estimator.telemetry.state import make_state_payload
-from bms_estimator.telemetry.weakest_cell import estimate_fields, remaining_capacity_ah
 
 MAX_WALL_S = 2.0**34
 """Latest plausible wall clock [s since 1970]: the year 2514."""

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.health import Payload
 from bms_estimator.model.quantity import FAST_INTERVAL_S, Entity, Quantity, counter_entity, raw_entity, total_entity
 
 _COUNTED = "at the terminals over all runs; with checkpoints the last saved value, so that it never decreases"

@@ -8,8 +8,7 @@ from typing import Literal, NamedTuple
 from pydantic import Field
 
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.health import Health
-from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.health import Health, Payload
 
 
 class Parameter(Payload):

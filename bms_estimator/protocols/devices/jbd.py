@@ -10,8 +10,13 @@ import struct
 from collections.abc import Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device import Device, SensorDefaults
-from bms_estimator.protocols.base.polled_protocol import MAX_ATTACHED_AGE_S, ParseResult, PolledProtocol
+from bms_estimator.protocols.base.polled_protocol import (
+    MAX_ATTACHED_AGE_S,
+    Device,
+    ParseResult,
+    PolledProtocol,
+    SensorDefaults,
+)
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import RecentCellVoltages
 

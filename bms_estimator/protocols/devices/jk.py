@@ -16,8 +16,7 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.protocols.base.device import Device, SensorDefaults
-from bms_estimator.protocols.base.polled_protocol import ParseResult, PolledProtocol
+from bms_estimator.protocols.base.polled_protocol import Device, ParseResult, PolledProtocol, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
 
 OLD_START, START = b"\x4e\x57", b"\x55\xaa\xeb\x90"

@@ -15,8 +15,8 @@ from bms_estimator.model.sample import (
     SampleStatus,
     remove_implausible,
 )
-from bms_estimator.protocols.base.device import Device, SensorDefaults
 from bms_estimator.protocols.base.device_clock import DeviceClock
+from bms_estimator.protocols.base.polled_protocol import Device, SensorDefaults
 from bms_estimator.protocols.base.probe_check import ProbeCheck
 from bms_estimator.protocols.base.reading import Reading, read_line
 from bms_estimator.protocols.base.reading_protocol import DeviceProtocol, cell_block

@@ -10,11 +10,10 @@ from bms_estimator.kernels.cell_model.chen_mora import delta, emf
 from bms_estimator.model.cell import CellModel, generic_cells, load_cell
 from bms_estimator.reports.formats import number
 from bms_estimator.reports.thesis import printed_pack, printed_values
-from bms_estimator.reports.thesis.quasi_steady import quasi_steady
 from bms_estimator.reports.thesis.report_items import Reproduction, Table
 from bms_estimator.reports.thesis.simulated_experiment import pack
 from bms_estimator.reports.thesis.simulation import ALPHA, CURRENT_A, Simulation, mean_error_percent
-from bms_estimator.reports.thesis.theorem_4_1_2 import C_RATES, PRODUCTS, measure
+from bms_estimator.reports.thesis.theorem_4_1_2 import C_RATES, PRODUCTS, measure, quasi_steady
 
 SMALLEST_CURRENT_A = 1e-4
 """Current that stands for the theorem's infinitesimal current [A]."""

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
-from bms_estimator.plot.style import COLORS, FAINT
-from bms_estimator.plot.thinning import thin
+from bms_estimator.plot.style import COLORS, FAINT, thin
 from bms_estimator.reports.svg_plot import plot
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.experiment import Experiment

@@ -11,8 +11,7 @@ import numpy as np
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun
 from bms_estimator.calibration.thesis.prediction import Prediction
 from bms_estimator.model.arrays import Floats
-from bms_estimator.plot.style import COLORS, FAINT
-from bms_estimator.plot.thinning import thin
+from bms_estimator.plot.style import COLORS, FAINT, thin
 from bms_estimator.reports.thesis.simulation import (
     SOC_GRID,
     element,

@@ -5,8 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from bms_estimator.model.config_file import Strict
-from bms_estimator.model.one_of import suggestion
+from bms_estimator.model.config_file import Strict, suggestion
 
 Name = Annotated[str, Field(min_length=1)]
 

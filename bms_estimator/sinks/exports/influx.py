@@ -25,9 +25,8 @@ from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 from bms_estimator.process.daemon_thread import DaemonThreadExecutor
-from bms_estimator.process.runtime import FIRST_DELAY_S, Backoff, finish
-from bms_estimator.process.systemd import credential_path
-from bms_estimator.settings.exports import InfluxSettings
+from bms_estimator.process.runtime import FIRST_DELAY_S, Backoff, credential_path, finish
+from bms_estimator.settings.outputs import InfluxSettings
 
 STATE = "bms_state"
 """Name of the measurement of states. The tag ``device`` is the pack."""

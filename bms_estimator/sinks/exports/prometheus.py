@@ -13,7 +13,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.quantity import quantity
-from bms_estimator.settings.exports import PrometheusSettings
+from bms_estimator.settings.outputs import PrometheusSettings
 from bms_estimator.sinks.exports.metrics_server import MetricsServer
 
 

@@ -12,13 +12,12 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from bms_estimator.model.events import events
-from bms_estimator.model.payloads.health import Health
-from bms_estimator.model.payloads.payload import Payload
+from bms_estimator.model.payloads.health import Health, Payload
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.quantity import Entity
 from bms_estimator.mqtt.connection import Message
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.mqtt import HomeAssistantSettings
+from bms_estimator.settings.outputs import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import (
     VALUES,
     DiscoveryInputs,

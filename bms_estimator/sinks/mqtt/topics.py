@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 from bms_estimator.model.events import Event
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.payloads.health import Health
-from bms_estimator.model.payloads.payload import PAYLOAD_VERSION, Payload
+from bms_estimator.model.payloads.health import PAYLOAD_VERSION, Health, Payload
 from bms_estimator.model.payloads.snapshot import Alarm, CellsReport, ForecastReport, Info, ParameterReport
 
 

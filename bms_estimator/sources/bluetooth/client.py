@@ -16,7 +16,7 @@ from bleak.exc import BleakError
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED, Reading, sample_json_line
 from bms_estimator.settings.sources.ble import BleSource
-from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
+from bms_estimator.sources.source import LineProducer, SourceUnavailableError
 
 
 def convert_sample(sample: Mapping[str, Any]) -> Reading | None:

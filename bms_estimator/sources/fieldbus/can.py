@@ -13,9 +13,9 @@ import can
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sources.can import CanSource
+from bms_estimator.settings.sources.fieldbus import CanSource
 from bms_estimator.sources.fieldbus.can_signals import CanDecoder
-from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
+from bms_estimator.sources.source import LineProducer, SourceUnavailableError
 
 RECEIVE_TIMEOUT_S = 0.2
 """Timeout of a receive call [s]. After each call the thread checks if it must stop."""

@@ -12,7 +12,7 @@ from cantools.database.can import Database, Message
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.settings.sources.can import CanSource, Signal
+from bms_estimator.settings.sources.fieldbus import CanSource, Signal
 
 DECIMALS = 5
 """Number of decimals of values in V, A and degC. Rounding removes errors of binary fractions: 5234 times 0.01 is 52.34."""

@@ -18,8 +18,8 @@ from pymodbus.exceptions import ModbusException
 
 from bms_estimator.protocols.base.reading import CONNECTED, Reading, sample_json_line
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sources.modbus import MAX_WORDS, ModbusSource, Register
-from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
+from bms_estimator.settings.sources.fieldbus import MAX_WORDS, ModbusSource, Register
+from bms_estimator.sources.source import LineProducer, SourceUnavailableError
 
 MAX_GAP_WORDS = 8
 """Maximum gap of unused registers in one request. One request reads the values on both sides at the same moment.

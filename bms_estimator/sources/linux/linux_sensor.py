@@ -17,7 +17,7 @@ from bms_estimator.process.daemon_thread import DaemonThreadExecutor
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.linux import LinuxSource
-from bms_estimator.sources.line_source import SILENT_PERIODS, LineProducer, SourceUnavailableError
+from bms_estimator.sources.source import SILENT_PERIODS, LineProducer, SourceUnavailableError
 
 SYS = Path("/sys")
 MAX_BYTES = 4096

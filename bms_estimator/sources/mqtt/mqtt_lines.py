@@ -26,8 +26,8 @@ from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.broker import BrokerSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.mqtt import MqttSource
-from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler
+from bms_estimator.sources.source import LineProducer, SourceUnavailableError
 
 MAX_QUEUED_MESSAGES = 2000
 """Maximum number of unread messages. A broker sends all retained messages of a wildcard at once."""

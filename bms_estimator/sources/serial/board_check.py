@@ -13,7 +13,7 @@ from threading import Thread
 import structlog
 
 from bms_estimator.protocols.base.reading_protocol import DeviceProtocol
-from bms_estimator.sources.serial.known_board_file import NO_BOARD, STORED_FIELDS, KnownBoardFile
+from bms_estimator.sources.serial.port_list import NO_BOARD, STORED_FIELDS, KnownBoardFile
 from bms_estimator.sources.source import Chunk
 
 MAX_PENDING_READS = 4096

@@ -19,8 +19,7 @@ from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog, SilenceLog
 from bms_estimator.sources.serial.board_check import BoardCheck, OtherBoardError
-from bms_estimator.sources.serial.known_board_file import KnownBoardFile
-from bms_estimator.sources.serial.port_list import NoPortError, open_port
+from bms_estimator.sources.serial.port_list import KnownBoardFile, NoPortError, open_port
 from bms_estimator.sources.serial.serial_port import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery, SerialPort
 from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
 

@@ -17,7 +17,7 @@ from bms_estimator.kernels.forecast.observed_load import simulate_observed_load
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack
-from bms_estimator.service.forecast_request import forecast_data, forecast_in_thread
+from bms_estimator.service.request_handlers import forecast_data, forecast_in_thread
 from tests.benchmarks.load import CELL, pulses
 from tests.benchmarks.table import Row
 

@@ -14,7 +14,7 @@ from urllib.parse import quote
 import pytest
 
 from bms_estimator.protocols.firmware.messages import Hello
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.settings.sampling import ChargeLimits
 from bms_estimator.simulation.esphome_node import SimulatedNode

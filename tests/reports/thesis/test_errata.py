@@ -28,9 +28,9 @@ from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports.thesis import printed_pack, printed_values
 from bms_estimator.reports.thesis.errata import errata, ocv_error_ohm
-from bms_estimator.reports.thesis.quasi_steady import quasi_steady
 from bms_estimator.reports.thesis.simulated_experiment import pack, resistance_ohm
 from bms_estimator.reports.thesis.simulation import Simulation, discharge, observer_settings, table_5_cell
+from bms_estimator.reports.thesis.theorem_4_1_2 import quasi_steady
 
 CHEN_MORA = load_cell("chen_mora")
 CAPACITY_AS = CHEN_MORA.cell.capacity_ah * 3600.0

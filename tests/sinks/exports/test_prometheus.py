@@ -15,7 +15,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.process import listener
-from bms_estimator.settings.exports import PrometheusSettings
+from bms_estimator.settings.outputs import PrometheusSettings
 from tests.free_port import free_port
 from tests.patience import LONG_S
 from tests.prometheus import PROMTOOL, promtool

@@ -57,7 +57,7 @@ def main() -> int:
     violations = find_broken(before["fields"], after["fields"])
     if violations and before["payload_version"] >= after["payload_version"]:
         sys.stderr.write(
-            "\n".join([*violations, "raise PAYLOAD_VERSION in bms_estimator/model/payloads/payload.py"]) + "\n"
+            "\n".join([*violations, "raise PAYLOAD_VERSION in bms_estimator/model/payloads/health.py"]) + "\n"
         )
         return 1
     RECORD.write_text(json.dumps(after, indent=1) + "\n", encoding="utf-8")

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from bms_estimator.cli.settings.asyncapi import ARGUMENTS, document
-from bms_estimator.model.payloads.payload import PAYLOAD_VERSION
+from bms_estimator.model.payloads.health import PAYLOAD_VERSION
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.requests import COMMANDS, READS
 from bms_estimator.sinks.mqtt.topics import TOPICS
@@ -23,7 +23,7 @@ def test_no_field_is_removed_or_changes_its_type_without_a_new_version() -> None
     violations = find_broken(before["fields"], after["fields"])
     if after["payload_version"] == before["payload_version"]:
         assert violations == [], (
-            "readers rely on these: raise PAYLOAD_VERSION in bms_estimator/model/payloads/payload.py"
+            "readers rely on these: raise PAYLOAD_VERSION in bms_estimator/model/payloads/health.py"
         )
     assert after["payload_version"] >= before["payload_version"]
 

@@ -20,7 +20,7 @@ from bms_estimator.mqtt.connection import Connection, ConnectOptions, DeliverySt
 from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING, ReceiveQueue
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import MAX_DELAY_S
-from bms_estimator.settings.mqtt import MqttSettings
+from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import CORRECTION_S, MqttSink
 from bms_estimator.store.outbox import Outbox

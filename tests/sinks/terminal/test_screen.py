@@ -10,8 +10,7 @@ from rich.screen import Screen
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.topic_cache import DeviceMessage, TopicCache
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from bms_estimator.sinks.terminal.screen import MAX_MESSAGES, build_screen
-from bms_estimator.sinks.terminal.sink import text_line
+from bms_estimator.sinks.terminal.sink import MAX_MESSAGES, build_screen, text_line
 from bms_estimator.sinks.terminal.view_state import PackView, ViewState
 from tests.sinks.snapshots import CELL_SNAPSHOT, NOW, SNAPSHOT_WITHOUT_SAMPLES, STACK_SNAPSHOT
 

@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.sources.ble import BleSource
-from bms_estimator.sources.line_source import LineProducer, SourceUnavailableError
+from bms_estimator.sources.source import LineProducer, SourceUnavailableError
 from tests.patience import LONG_S
 
 SKIP_REASON = "aiobmsble is not installed: it needs Python 3.12 and the extra ble"

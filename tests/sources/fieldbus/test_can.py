@@ -13,10 +13,10 @@ import pytest
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sources.can import CanSource
+from bms_estimator.settings.sources.fieldbus import CanSource
 from bms_estimator.sources.factory import open_source
 from bms_estimator.sources.fieldbus.can import BUS_OFF_BIT, CanProducer
-from bms_estimator.sources.line_source import SourceUnavailableError
+from bms_estimator.sources.source import SourceUnavailableError
 from tests.patience import LONG_S, until
 from tests.serial_line import Line
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.settings.sources.can import PROFILES, CanSource, CellSignals
+from bms_estimator.settings.sources.fieldbus import CAN_PROFILES, CanSource, CellSignals
 from bms_estimator.sources.fieldbus.can_signals import MAX_AGE_S, CanDecoder, FrameId
 
 PYLONTECH_DATA = bytes([0x72, 0x14, 0x85, 0xFF, 0xD7, 0x00])
@@ -200,7 +200,7 @@ def test_name_of_a_cell_signal_is_numbered_from_the_first_number_on() -> None:
     assert [signal.signal for signal in signals] == ["C0", "C1"]
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", CAN_PROFILES)
 def test_resolutions_of_a_profile_are_the_factors_of_its_dbc_file(profile: str) -> None:
     text = (files("bms_estimator.sources.fieldbus") / f"{profile}.dbc").read_text()
     database = cantools.database.load_string(text, database_format="dbc")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sources.can import CanSource
+from bms_estimator.settings.sources.fieldbus import CanSource
 from bms_estimator.sources.fieldbus.can_signals import CanDecoder, FrameId
 
 PAGE = (Path(__file__).parents[3] / "docs" / "pack" / "fieldbus.md").read_text(encoding="utf-8")

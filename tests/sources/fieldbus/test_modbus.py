@@ -12,10 +12,10 @@ from pymodbus.constants import ExcCodes
 
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sources.modbus import ModbusSource
+from bms_estimator.settings.sources.fieldbus import ModbusSource
 from bms_estimator.sources.factory import open_source
 from bms_estimator.sources.fieldbus.modbus import ModbusProducer
-from bms_estimator.sources.line_source import SourceUnavailableError
+from bms_estimator.sources.source import SourceUnavailableError
 from tests.free_port import free_port
 from tests.patience import LONG_S
 from tests.sources.fieldbus.modbus_device import Registers, float_words, serial_device, tcp_device

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from bms_estimator.settings.sources.modbus import MAX_WORDS, PROFILES, CellRegisters, ModbusSource, Register
+from bms_estimator.settings.sources.fieldbus import MAX_WORDS, MODBUS_PROFILES, CellRegisters, ModbusSource, Register
 from bms_estimator.sources.fieldbus.modbus import (
     MAX_GAP_WORDS,
     RegisterQuantity,
@@ -183,7 +183,7 @@ def test_settings_override_the_profile() -> None:
     assert source_settings.voltage.address == 259
 
 
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("profile", MODBUS_PROFILES)
 def test_profile_sets_the_sign_of_the_current(profile: str) -> None:
     assert source(profile=profile).sensor_defaults["current_sign"] == "charge_positive"
 

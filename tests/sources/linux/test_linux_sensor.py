@@ -11,8 +11,8 @@ import pytest
 
 from bms_estimator.protocols.base.reading import CONNECTED, Reading, read_line
 from bms_estimator.settings.sources.linux import LinuxSource
-from bms_estimator.sources.line_source import SourceUnavailableError
 from bms_estimator.sources.linux.linux_sensor import LinuxSensor
+from bms_estimator.sources.source import SourceUnavailableError
 from tests.patience import LONG_S
 from tests.sources.linux.sysfs_folder import hwmon, iio
 

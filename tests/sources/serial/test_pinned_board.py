@@ -23,7 +23,7 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import board_check, port_list, serial_source
-from bms_estimator.sources.serial.known_board_file import NO_BOARD, KnownBoardFile
+from bms_estimator.sources.serial.port_list import NO_BOARD, KnownBoardFile
 from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.command_line import run
 from tests.patience import until

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bms_estimator.model.sample import CurrentSign
-from bms_estimator.sources.captures.tables.units import ColumnName, fold
+from bms_estimator.sources.captures.tables.cell_values import ColumnName, fold
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,20 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SampleStatus
-from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, CellKind, parse_date_time
+from bms_estimator.sources.captures.tables.cell_values import (
+    MAX_TEXT_CHARACTERS,
+    SI_UNITS,
+    CellKind,
+    Quantity,
+    Unit,
+    find_unit,
+    parse_date_time,
+)
 from bms_estimator.sources.captures.tables.dialects import Dialect
 from bms_estimator.sources.captures.tables.history_records import CsvRecords, JsonRecords, Labels, Record
 from bms_estimator.sources.captures.tables.layout import Column, ColumnRole, Layout, RawBlock, Role
 from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder, shorten_cells, split_given_unit
 from bms_estimator.sources.captures.tables.time_base import unix_unit
-from bms_estimator.sources.captures.tables.units import SI_UNITS, Quantity, Unit, find_unit
 
 SETTLE_S = 0.5
 """Maximum time between the voltage and the current of one sample [s], the default of an MQTT source."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.tables.cell_values import Quantity, find_unit
 from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder, shorten_cells
 from bms_estimator.sources.captures.tables.text_file import TextFile
 from bms_estimator.sources.captures.tables.text_table import (
@@ -18,7 +19,6 @@ from bms_estimator.sources.captures.tables.text_table import (
     split_cells,
     unquote,
 )
-from bms_estimator.sources.captures.tables.units import Quantity, find_unit
 
 
 class _Form(NamedTuple):

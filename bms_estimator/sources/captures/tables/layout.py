@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.model.sample import MAX_C, MIN_C, NO_CELLS, SAMPLE, CellBlock, SampleBlock, remove_implausible
-from bms_estimator.sources.captures.tables.cell_values import CellKind, parser, time_kind
-from bms_estimator.sources.captures.tables.dialects import Dialect
-from bms_estimator.sources.captures.tables.units import (
+from bms_estimator.sources.captures.tables.cell_values import (
     SI_UNITS,
+    CellKind,
     Quantity,
     Unit,
+    parser,
+    time_kind,
 )
+from bms_estimator.sources.captures.tables.dialects import Dialect
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 REQUIRED: tuple[Quantity, ...] = ("time", "current", "voltage")

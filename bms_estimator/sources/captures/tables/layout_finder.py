@@ -11,7 +11,17 @@ from bms_estimator.model.cell_voltage_columns import present_columns
 from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
-from bms_estimator.sources.captures.tables.cell_values import CellKind, parse_number
+from bms_estimator.sources.captures.tables.cell_values import (
+    SI_UNITS,
+    CellKind,
+    ColumnName,
+    Quantity,
+    Unit,
+    find_unit,
+    fold,
+    parse_number,
+    split_unit,
+)
 from bms_estimator.sources.captures.tables.dialects import CLOCKS, DIALECTS, DISCHARGE_CURRENTS, GENERIC, OWN, Dialect
 from bms_estimator.sources.captures.tables.layout import (
     INSTANCE,
@@ -24,15 +34,6 @@ from bms_estimator.sources.captures.tables.layout import (
     ColumnRole,
     Layout,
     Role,
-)
-from bms_estimator.sources.captures.tables.units import (
-    SI_UNITS,
-    ColumnName,
-    Quantity,
-    Unit,
-    find_unit,
-    fold,
-    split_unit,
 )
 
 MAP_SYNTAX = "one or more of time=COLUMN,current=COLUMN,voltage=COLUMN,temperature=COLUMN,sheet=SHEET,instance=NUMBER"

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
+from bms_estimator.sources.captures.tables.cell_values import DATES, TIME_UNITS, CellKind, Unit, find_unit
 from bms_estimator.sources.captures.tables.dialects import OWN
 from bms_estimator.sources.captures.tables.layout import Column, Layout, RawBlock, Role, without_clock
-from bms_estimator.sources.captures.tables.units import TIME_UNITS, Unit, find_unit
 
 FIRST_UNIX_S, LAST_UNIX_S = 9e8, 4e9
 """Range of Unix times in a capture: 1998 to 2096 [s]."""

@@ -1,0 +1,215 @@
+"""Settings of the outputs of a service: the broker, the page and the exports."""
+
+import ipaddress
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field, model_validator
+
+from bms_estimator.model.config_file import Strict
+from bms_estimator.settings.broker import BrokerSettings, BrokerUrls
+
+Topic = Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")]
+"""MQTT topic without wildcards and spaces, and without a slash at either end."""
+
+
+class HomeAssistantSettings(Strict):
+    """Discovery by Home Assistant over the MQTT broker; see docs/pack/home-assistant.md."""
+
+    enabled: bool = Field(
+        default=True, description="false: no discovery; the pack's device is removed from Home Assistant"
+    )
+    discovery_prefix: Topic = Field(
+        default="homeassistant", description="discovery prefix of Home Assistant's MQTT integration"
+    )
+    status_topic: Topic = Field(default="homeassistant/status", description="topic of Home Assistant's birth message")
+    name: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None, description="name of the pack's device; default: pack.name"
+    )
+    current_sign: Literal["discharge_positive", "charge_positive"] = Field(
+        default="discharge_positive", description="direction of positive current and power in Home Assistant"
+    )
+    names: dict[str, Annotated[str, Field(min_length=1)]] = Field(
+        default={},
+        description='names of entities in place of the default names, such as energy_in_kwh = "Energie geladen"',
+    )
+
+
+Command = Literal["set_soc", "current_zero", "acknowledge_alarm", "publish_rate", "forget_pack"]
+"""Name of a request that changes the estimator or the service."""
+
+
+class MqttSettings(BrokerSettings):
+    """MQTT broker, and the commands that clients may send."""
+
+    base_topic: Annotated[str, Field(pattern=r"^[^+#\s/]([^+#\s]*[^+#\s/])?$")] = Field(
+        default="bms", description="prefix of all topics; must not contain +, # or spaces, nor begin or end with /"
+    )
+    profile: Literal["venus-os"] | None = Field(
+        default=None,
+        description="also publish the battery for a Victron GX device, in the format of dbus-mqtt-battery, on the topic venus below the topic of the pack",
+    )
+    commands: tuple[Command, ...] = Field(default=(), description="commands that clients may send; default: none")
+
+
+DEFAULT_LISTEN = "127.0.0.1:8765"
+"""Default address of the page, host:port."""
+
+
+class ListenAddress(NamedTuple):
+    """Address on which a server listens."""
+
+    host: str
+    port: int
+    """TCP port; 0: any free port."""
+
+    @property
+    def loopback(self) -> bool:
+        """True if only programs on this machine can connect."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+def parse_listen(text: str) -> ListenAddress:
+    """Parse ``host:port``.
+
+    Raises:
+        ValueError: The text is not a host and a port.
+    """
+    try:
+        url = urlsplit(f"//{text}")
+        host, port = url.hostname, url.port
+        (host or "").encode("idna")  # the resolver encodes the name this way and would fail later
+    except ValueError as error:
+        raise ValueError(f"must be host:port: {error}") from None
+    if not host or port is None or url.netloc != text or "@" in text:
+        raise ValueError('must be host:port, such as "127.0.0.1:8765" or "[::1]:8765"')
+    return ListenAddress(host, port)
+
+
+def _validate_listen(text: str) -> str:
+    parse_listen(text)
+    return text
+
+
+Address = Annotated[str, AfterValidator(_validate_listen)]
+"""Text ``host:port``."""
+
+
+class PageSettings(Strict):
+    """Live web page of the pack."""
+
+    listen: Address = Field(
+        default=DEFAULT_LISTEN,
+        description="host:port of the page; packs of one process with the same address share a page. An address that other machines can reach, such as 0.0.0.0:8765, requires token_file",
+    )
+    token_file: Path | None = Field(
+        default=None,
+        description="file with the access token; a name without a folder is a systemd credential",
+    )
+    hosts: tuple[str, ...] = Field(
+        default=(), description="further host names under which browsers request the page, for example behind a proxy"
+    )
+
+    @property
+    def address(self) -> ListenAddress:
+        """Host and port of ``listen``."""
+        return parse_listen(self.listen)
+
+    @model_validator(mode="after")
+    def _require_token_unless_local(self) -> Self:
+        if self.token_file is None and not self.address.loopback:
+            raise ValueError(
+                f'listen = "{self.listen}" is open to other machines: name a token_file, or listen on 127.0.0.1'
+            )
+        return self
+
+
+class EdgeSettings(BrokerSettings):
+    """Edge of a fleet: fleet server to which raw samples are sent, and their storage; see docs/fleet/edge.md."""
+
+    section: ClassVar[str] = "edge"
+
+    url: BrokerUrls = Field(
+        default="mqtt://localhost:1883",
+        description="URL of the fleet server, mqtt://host:port or, with TLS, mqtts://host:port; or a list of URLs to try in turn",
+    )
+    block_s: Annotated[float, Field(ge=1.0, le=3600.0)] = Field(
+        default=60.0,
+        description="duration of a block of samples, which is stored and sent as one message; a killed process loses at most one block",
+    )
+    store_mib: Annotated[float, Field(ge=0.1, le=100_000.0)] = Field(
+        default=100.0,
+        description="maximum size of the stored blocks [MiB]; the default holds 100 days at 1 Hz. A full store drops its oldest block",
+    )
+    cells: bool = Field(
+        default=False,
+        description="send the voltages of the single cells too, if the source delivers them; upgrade all workers first, because "
+        "earlier ones reject these blocks",
+    )
+
+
+Name = Annotated[str, Field(min_length=1)]
+
+
+class InfluxSettings(Strict):
+    """Export of estimates and alarm changes to InfluxDB, or to another server that accepts its line protocol over HTTP."""
+
+    url: Annotated[str, Field(pattern=r"^https?://(\[[^\]\s]+\]|[^/@\s?#:]+)(:\d{1,5})?(/[^@\s?#]*)?$")] = Field(
+        default="http://localhost:8086", description="http://host:port or https://host:port, without user and password"
+    )
+    database: Name = Field(default="bms", description="database of InfluxDB 1; ignored if bucket is set")
+    username: str | None = Field(default=None, description="user name for InfluxDB 1, if required")
+    password_file: Path | None = Field(
+        default=None,
+        description="file with the password for InfluxDB 1; a name without a folder is a systemd credential",
+    )
+    bucket: Name | None = Field(default=None, description="bucket of InfluxDB 2, which replaces database")
+    org: Name | None = Field(default=None, description="organization of InfluxDB 2")
+    token_file: Path | None = Field(
+        default=None,
+        description="file with a write token of InfluxDB 2; a name without a folder is a systemd credential",
+    )
+    ca_file: Path | None = Field(
+        default=None, description="certificate authority of an https server; default: the system's certificates"
+    )
+    every_s: Annotated[float, Field(ge=0.1, le=3600)] = Field(
+        default=10.0, description="interval between two write requests"
+    )
+
+    @model_validator(mode="after")
+    def _check_credentials(self) -> Self:
+        if self.bucket and (self.username or self.password_file):
+            raise ValueError("username and password_file: of no use with bucket; give token_file instead")
+        if not self.bucket and (self.token_file or self.org):
+            raise ValueError("org and token_file: of no use without bucket")
+        return self
+
+
+class PrometheusSettings(Strict):
+    """Endpoint from which Prometheus reads metrics."""
+
+    listen: Annotated[str, Field(pattern=r"^([^:\s/@]+|\[[0-9A-Fa-f:]+\]):\d{1,5}$")] = Field(
+        default="127.0.0.1:9108",
+        description="host:port of this pack's metrics; every client that can connect to it can read them",
+    )
+
+    @property
+    def host(self) -> str:
+        """Host without brackets."""
+        return self.listen.rpartition(":")[0].strip("[]")
+
+    @property
+    def port(self) -> int:
+        """TCP port."""
+        return int(self.listen.rpartition(":")[2])
+
+    @model_validator(mode="after")
+    def _check_address(self) -> Self:
+        if not 0 < self.port < 65536:
+            raise ValueError("port: must be 1 to 65535")
+        self.host.encode("idna")  # the resolver encodes the name this way and would fail later
+        return self
