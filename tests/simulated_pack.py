@@ -13,8 +13,8 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.pack.pack import Pack
 from bms_estimator.service.publisher import Publisher
+from bms_estimator.settings.observer import BOARD
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sampling import BOARD
 from bms_estimator.simulation.simulated_bank import BankCells, BankHistory, SimulatedBank
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.alarms.message import Change

@@ -1,6 +1,7 @@
 """File with counters and alarms of a pack. Its name contains only the pack's name, so that it survives edited settings.
 
-A checksum in its first line reveals any damage. Other files use the same checksum.
+A checksum in its first line reveals any damage. Other files use the same checksum. The devices and cells of a pack
+distinguish a new pack from a renamed one.
 """
 
 import contextlib
@@ -12,16 +13,61 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple, Self, TypeGuard
 
 import numpy as np
 import structlog
 
-from bms_estimator.checkpoint.pack_description import PackDescription
 from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.private_file import overwrite_private, read_private, write_private
 from bms_estimator.process.state_folder import is_locked
+from bms_estimator.settings.pack import BmsSettings, Settings
+from bms_estimator.settings.sources.linux import BleSource
 from bms_estimator.telemetry.publish_window import ChargeEnergy, new_totals
+
+SERIAL_IDS = "/dev/serial/by-id/"
+"""Folder of the names of serial ports that contain the serial number of the device."""
+
+
+class PackDescription(NamedTuple):
+    """Devices and cells of a pack."""
+
+    devices: tuple[tuple[str, str], ...] = ()
+    """Kind and address of each device. The kind is empty if the hardware does not give the address."""
+    cells: str = ""
+    """Cell and number of cells in series."""
+
+    @classmethod
+    def of(cls, settings: Settings) -> Self:
+        """Return the description of a pack."""
+        devices = tuple(_device(each) for each in (settings, settings.bms) if each)
+        return cls(devices, f"{settings.pack.series} {settings.pack.cell}")
+
+    def differs(self, devices: object, cells: object) -> bool:
+        """Return True only if a saved description is surely that of another pack.
+
+        No device may be the same. Besides, either the cells must differ, or both devices must have an address of one
+        kind that the hardware gives: Bluetooth address, or serial number of a USB adapter. A topic or host may have been
+        renamed together with the pack, and a latched alarm must survive this.
+
+        Args:
+            devices: Saved devices, as JSON; None: unknown.
+            cells: Saved cells.
+        """
+        saved = [tuple(each) for each in devices] if isinstance(devices, list) else []
+        if not saved or not self.devices or set(saved) & set(self.devices):
+            return False
+        return cells != self.cells or saved[0][0] == self.devices[0][0] != ""
+
+
+def _device(settings: Settings | BmsSettings) -> tuple[str, str]:
+    """Return kind and address of a device."""
+    source = settings.source
+    if isinstance(source, BleSource) and source.address:
+        return "bluetooth", source.address.upper()
+    address = settings.sensor.port if source is None else source.short_description
+    return ("serial" if address.startswith(SERIAL_IDS) else ""), address
+
 
 CHECKSUM_BYTES = 9
 """Length of the first line [bytes]."""

@@ -35,8 +35,7 @@ from bms_estimator.checkpoint.arrays_file import (
     without_observer,
     write_arrays,
 )
-from bms_estimator.checkpoint.pack_description import PackDescription
-from bms_estimator.checkpoint.run_file import RunFile, SavedRun
+from bms_estimator.checkpoint.run_file import PackDescription, RunFile, SavedRun
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.errors import UserError
@@ -52,8 +51,8 @@ from bms_estimator.pack.state import (
     DeclaredValues,
     PackState,
 )
-from bms_estimator.process.boot_clock import BootTimestamp, boot_timestamp
-from bms_estimator.process.daemon_thread import DaemonThreadExecutor
+from bms_estimator.process.host import BootTimestamp, boot_timestamp
+from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.settings.pack import Settings
 
 FORMAT = 8

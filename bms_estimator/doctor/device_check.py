@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
 from bms_estimator.estimator.settings_plausibility import implausible_measurement
-from bms_estimator.installation.root_command import root_command
+from bms_estimator.installation.machine import root_command
 from bms_estimator.model.cell_slots import is_live
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.pack import Settings

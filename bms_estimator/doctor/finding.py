@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from bms_estimator.doctor.systemd_unit import SystemdUnit
-from bms_estimator.installation.root_command import root_command
+from bms_estimator.installation.machine import root_command
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.state_folder import is_locked, state_folder_path
 from bms_estimator.settings.pack import Settings

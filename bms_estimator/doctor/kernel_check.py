@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bms_estimator.doctor.finding import ExaminedPack, Finding, ok, warning
-from bms_estimator.installation.root_command import root_command
+from bms_estimator.installation.machine import root_command
 from bms_estimator.numba_cache import SHIPPED_FOLDER, cache_folders, source_digest
-from bms_estimator.process.memory import available_bytes
+from bms_estimator.process.host import available_bytes
 from bms_estimator.service.kernel_compilation import CHILD_BYTES, COMPLETE_FILE
 
 NAME = "kernel cache"

@@ -8,7 +8,7 @@ from bms_estimator.kernels.kalman_filter.anchors import ANCHOR_SETTINGS, FULL_ST
 from bms_estimator.kernels.kalman_filter.ekf import INDEPENDENT_R_STD
 from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.model.monotone_cubic import MonotoneCubic
-from bms_estimator.settings.sampling import ChargeLimits
+from bms_estimator.settings.observer import ChargeLimits
 
 VOLTAGE_ERROR = 0.005
 """Relative error of the voltage of charger and source. A BMS seldom measures the voltage of a pack more accurately."""

@@ -23,9 +23,16 @@ from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import (
+    BOARD,
+    EXACT,
+    NO_LIMITS,
+    ChargeLimits,
+    IdentifierSettings,
+    ObserverSettings,
+    Sampling,
+)
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sampling import BOARD, EXACT, NO_LIMITS, ChargeLimits, Sampling
 
 TraceBlock = NDArray[np.void]
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""

@@ -9,8 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.estimator.anchor_settings import anchor_settings
-from bms_estimator.estimator.filter_settings import filter_settings, max_ohm, unmeasured_s
-from bms_estimator.estimator.learning_settings import LEAK_S, RATE_HZ, REACH, learning_settings
+from bms_estimator.estimator.filter_settings import (
+    LEAK_S,
+    RATE_HZ,
+    REACH,
+    filter_settings,
+    learning_settings,
+    max_ohm,
+    unmeasured_s,
+)
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, PARAMETERS, emf, r_s, r_tl, r_ts
 from bms_estimator.kernels.cell_model.current_interpolation import MAX_STEP_PERIODS
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
@@ -24,8 +31,16 @@ from bms_estimator.model.arrays import exp
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.monotone_cubic import MonotoneCubic
 from bms_estimator.model.pack_model import FuelCellModel, PackModel
-from bms_estimator.settings.observer import SCHEME_2_EPSILON, SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings
-from bms_estimator.settings.sampling import EXACT, NO_LIMITS, ChargeLimits, Sampling
+from bms_estimator.settings.observer import (
+    EXACT,
+    NO_LIMITS,
+    SCHEME_2_EPSILON,
+    SCHEME_2_LAMBDA,
+    ChargeLimits,
+    IdentifierSettings,
+    ObserverSettings,
+    Sampling,
+)
 
 MEMORY_S = 60.0
 """Time constant with which the learning law of a stack discounts data [s]. Water and gas supply change within a minute."""

@@ -3,11 +3,20 @@
 import errno
 import os
 import subprocess
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from bms_estimator.installation import paths
 from bms_estimator.model.errors import UserError
+
+
+def root_command(*arguments: str | Path) -> list[str]:
+    """Return the command that runs this program as root, with its full path, because sudo does not search a virtual environment."""
+    program = Path(sys.executable).with_name(paths.NAME)
+    return ["sudo", str(program), *map(str, arguments)]
+
 
 _LINK_ERROR = "{}: is a symbolic link, which may lead to another user's file; replace it with the file"
 

@@ -4,8 +4,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-from bms_estimator.mqtt.subscriber import Subscriber
-from bms_estimator.mqtt.topic_cache import DeviceMessage
+from bms_estimator.mqtt.topic_cache import DeviceMessage, Subscriber
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer

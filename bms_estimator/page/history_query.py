@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.daemon_thread import DaemonThreadExecutor
+from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.store.history import MINUTE_S
 from bms_estimator.store.history_reader import HistoryReader
 

@@ -6,9 +6,7 @@ from typing import Any
 
 from bms_estimator.pack_model.aging_course import RESISTANCE_SOC, AgingCourse, Course
 from bms_estimator.plot.style import COLORS, draw_band
-from bms_estimator.reports.formats import DAY_S, duration_text, number
-from bms_estimator.reports.report_page import Group, Plot
-from bms_estimator.reports.svg_plot import small_plot
+from bms_estimator.reports.report_parts import DAY_S, Group, Plot, duration_text, number, small_plot
 
 MONTH_S = 30.0 * DAY_S
 """Length of a month in "change per month" [s]."""

@@ -18,9 +18,7 @@ from bms_estimator.estimator.stability_conditions import failed_conditions
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.plot.cell_curves import ELEMENTS, PAIRS, SocCurve, element_over_soc, stability_limits
-from bms_estimator.reports.formats import number
-from bms_estimator.reports.report_page import Group, Plot, ReportPage, Section
-from bms_estimator.reports.svg_plot import small_plot
+from bms_estimator.reports.report_parts import Group, Plot, ReportPage, Section, number, small_plot
 from bms_estimator.reports.thesis import printed_values
 
 TABULATED_SOC = (0.2, 0.5, 0.8)

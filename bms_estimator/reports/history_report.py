@@ -23,9 +23,17 @@ from bms_estimator.plot.style import (
     widen,
 )
 from bms_estimator.reports.aging_group import AgingHistory, aging_group
-from bms_estimator.reports.formats import DAY_S, MINUTE_S, duration_text, number
-from bms_estimator.reports.report_page import Group, Plot, ReportPage, Section
-from bms_estimator.reports.svg_plot import small_plot
+from bms_estimator.reports.report_parts import (
+    DAY_S,
+    MINUTE_S,
+    Group,
+    Plot,
+    ReportPage,
+    Section,
+    duration_text,
+    number,
+    small_plot,
+)
 
 MAX_DAYS = 62
 """Maximum number of days in the table. Older days are only in the figures."""

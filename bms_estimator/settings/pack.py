@@ -1,7 +1,11 @@
-"""Settings of one pack, from ``pack.toml``. The name of a setting with a unit ends in the unit."""
+"""Settings of one pack, from ``pack.toml``. The name of a setting with a unit ends in the unit.
+
+Also the new settings file of a pack.
+"""
 
 import os
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError, model_validator
@@ -10,7 +14,7 @@ from bms_estimator.model.config_file import Fraction, Positive, Strict, read_tom
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.registry import max_batteries
 from bms_estimator.settings.alarms import AlarmSettings
-from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
+from bms_estimator.settings.observer import ChargeLimits, IdentifierSettings, ObserverSettings, Sampling
 from bms_estimator.settings.outputs import (
     EdgeSettings,
     HomeAssistantSettings,
@@ -19,11 +23,10 @@ from bms_estimator.settings.outputs import (
     PageSettings,
     PrometheusSettings,
 )
-from bms_estimator.settings.sampling import ChargeLimits, Sampling
 from bms_estimator.settings.sensor import ALLOWED_WITH_SOURCE, SensorSettings
-from bms_estimator.settings.sources.ble import BleSource
+from bms_estimator.settings.settings_template import GivenSettings, settings_file
 from bms_estimator.settings.sources.fieldbus import CanSource, ModbusSource
-from bms_estimator.settings.sources.linux import LinuxSource
+from bms_estimator.settings.sources.linux import BleSource, LinuxSource
 from bms_estimator.settings.sources.mqtt import MqttSource
 
 SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]
@@ -313,3 +316,36 @@ def _resolve_paths(section: Section, folder: Path) -> Section:
         elif isinstance(value, Path) and (folder / value).is_file() and not os.access(credentials / value, os.R_OK):
             changed[key] = folder / value  # an absolute path remains as it is
     return section.model_copy(update=changed) if changed else section
+
+
+def create_pack_file(path: Path, given: GivenSettings = MappingProxyType({})) -> None:
+    """Write a new settings file that lists every setting; only ``given`` settings differ from the defaults.
+
+    Raises:
+        UserError: The file exists already, or cannot be written.
+    """
+    require_new(path)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            try:
+                file.write(settings_file(Settings, given))
+                file.flush()
+            except OSError:
+                path.unlink()  # a part of the file would prevent the next attempt
+                raise
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def require_new(path: Path) -> None:
+    """Reject the path of a file that exists, or that cannot be created.
+
+    Raises:
+        UserError: The file exists, or its folder does not exist or cannot be written.
+    """
+    if os.path.lexists(path):
+        raise UserError(f"{path}: exists already and is not changed; give another name")
+    if not path.parent.is_dir():
+        raise UserError(f"{path}: cannot be written: there is no folder {path.parent}; create it, or give another name")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise UserError(f"{path}: cannot be written: no permission to write to the folder {path.parent.resolve()}")

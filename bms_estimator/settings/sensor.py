@@ -7,7 +7,7 @@ from pydantic import Field, ModelWrapValidatorHandler, model_validator
 from bms_estimator.model.config_file import NotNegative, OneOf, Positive, Strict
 from bms_estimator.protocols.base.sensor_correction import SensorCorrection
 from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS, max_batteries, valid_addresses
-from bms_estimator.settings.sampling import BOARD_GAIN_STD
+from bms_estimator.settings.observer import BOARD_GAIN_STD
 
 ALLOWED_WITH_SOURCE = {"port": ("auto",), "protocol": ("binary", "text"), "serial": (None,), "address": (None,)}
 """Values that settings of a serial device may have if there is a ``[source]``, by setting. The first value is the

@@ -10,8 +10,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.config_file import parse_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.service.pack_check import check_settings, summarize
-from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.pack_file import create_pack_file
+from bms_estimator.settings.pack import Settings, create_pack_file
 from bms_estimator.settings.settings_template import settings_file
 from bms_estimator.setup.answers import Answers
 

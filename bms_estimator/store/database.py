@@ -13,7 +13,7 @@ from typing import Any, Self, TypeVar
 
 import structlog
 
-from bms_estimator.process.daemon_thread import DaemonThreadExecutor
+from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.store.migrations import MIGRATIONS, NewerVersionError, OtherTablesError, migrate
 
 DISK_TIMEOUT_S = 10.0

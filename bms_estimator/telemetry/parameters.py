@@ -30,8 +30,11 @@ from bms_estimator.model.cell import CellModel, TableOcv
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.monotone_cubic import MonotoneCubic
 from bms_estimator.model.payloads.snapshot import OcvCurve, Parameter, ParameterReport
-from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
-from bms_estimator.telemetry.series_resistance import series_resistance_parameters, settling_reason
+from bms_estimator.telemetry.fuel_cell_parameters import (
+    fuel_cell_parameters,
+    series_resistance_parameters,
+    settling_reason,
+)
 from bms_estimator.telemetry.state import finite
 
 FIT_POINTS = 101

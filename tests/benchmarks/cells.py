@@ -20,7 +20,7 @@ from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.alarm_limits import MIN_READING_ERROR_V, MIN_SHORT_C, balancing_voltage_v
-from bms_estimator.settings.sampling import BOARD
+from bms_estimator.settings.observer import BOARD
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 
 CELLS, CAPACITY_AH, STEP_S = 12, 50.0, 30.0

@@ -12,7 +12,7 @@ from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.model.arrays import fields
-from bms_estimator.process.boot_clock import BootTimestamp
+from bms_estimator.process.host import BootTimestamp
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, learned_estimator
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator import Estimator, load_capture, load_cell
 from bms_estimator.protocols.base.polled_protocol import BMS_GAIN_STD
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import Sampling
 from tests.estimator.anywhere.score import score
 
 

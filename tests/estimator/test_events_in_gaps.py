@@ -12,7 +12,7 @@ from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import Sampling
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, Capture, Case, capture
 from tests.estimator.anywhere.cycles import Cycle, true_curve
 from tests.estimator.anywhere.use import DAY_S, days

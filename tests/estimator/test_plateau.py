@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import Sampling
 from tests.estimator.simulated_cell import simulate_file
 
 CAPACITY_AH = 2.3

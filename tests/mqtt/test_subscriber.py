@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 import structlog
 
-from bms_estimator.mqtt.subscriber import MAX_BYTES, Subscriber
-from bms_estimator.mqtt.topic_cache import DeviceMessage
+from bms_estimator.mqtt.topic_cache import MAX_BYTES, DeviceMessage, Subscriber
 from bms_estimator.settings.outputs import MqttSettings
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy

@@ -12,7 +12,7 @@ from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.equations import Equations
 from bms_estimator.pack_model.prediction import Reference
 from bms_estimator.pack_model.unknowns import SCALES, Unknowns
-from bms_estimator.settings.sampling import EXACT, Sampling
+from bms_estimator.settings.observer import EXACT, Sampling
 
 CAPACITY_AH = 3.0
 REST_ROWS_S = (60.0, 120.0, 600.0, 1800.0, 3600.0)

@@ -14,7 +14,7 @@ from bms_estimator.kernels.accumulators.history import (
 from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.slow_fit import SlowFit
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
 
 WINDOW_S = 1.0

@@ -12,7 +12,7 @@ from bms_estimator.pack_model.fit import LN_Q, SOC
 from bms_estimator.pack_model.handover import adopt_curves
 from bms_estimator.pack_model.intervals import MAX_INTERVALS, Intervals
 from bms_estimator.pack_model.solve import minimize
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import Sampling
 from tests.pack_model.histories import (
     Truth,
     cell_curves,

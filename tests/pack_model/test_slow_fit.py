@@ -19,7 +19,7 @@ from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.fit import FitError, PackFit
 from bms_estimator.pack_model.slow_fit import SlowFit, run_now
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import Sampling
 from tests.estimator.simulated_cell import TRUTH, measured
 from tests.pack_model.quick_fit import quick_fit
 

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.settings.pack_file import create_pack_file, require_new
+from bms_estimator.settings.pack import create_pack_file, require_new
 
 
 def test_full_disk_leaves_no_part_of_the_file(full_disk):

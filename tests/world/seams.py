@@ -20,7 +20,7 @@ from typing import Any
 
 from bms_estimator.model import clock
 from bms_estimator.process import boot_clock
-from bms_estimator.process.daemon_thread import DaemonThreadExecutor
+from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.telemetry import health
 from tests.world.disk import Disk
 from tests.world.threads import Threads

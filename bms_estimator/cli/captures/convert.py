@@ -24,8 +24,8 @@ from bms_estimator.cli.options.capture_options import (
     print_warnings,
 )
 from bms_estimator.model.arrays import Records, structured_array
-from bms_estimator.model.cell_voltage_columns import cell_voltage_columns
 from bms_estimator.model.charge_count import TimeFaults
+from bms_estimator.model.columns import cell_voltage_columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
 from bms_estimator.model.sample import SAMPLE, SampleBlock

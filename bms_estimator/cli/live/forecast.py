@@ -36,7 +36,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.reports.formats import duration_text, number
+from bms_estimator.reports.report_parts import duration_text, number
 from bms_estimator.service.request_handlers import as_json_data
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import open_capture

@@ -7,7 +7,7 @@ import typer
 from pydantic.json_schema import models_json_schema
 
 from bms_estimator.model.payloads.health import PAYLOAD_VERSION
-from bms_estimator.mqtt.receive_queue import MAX_BYTES
+from bms_estimator.mqtt.connection import MAX_BYTES
 from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import DEVICE_NAME, MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY

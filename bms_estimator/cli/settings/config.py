@@ -14,8 +14,7 @@ from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.service.pack_check import check_settings, summarize
 from bms_estimator.settings.alarm_limits import monitored_alarms
-from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.pack_file import create_pack_file
+from bms_estimator.settings.pack import Settings, create_pack_file
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Write, check or show a pack's settings.")
 

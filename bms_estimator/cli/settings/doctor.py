@@ -21,7 +21,7 @@ from bms_estimator.doctor.device_check import MIN_FIRST_SAMPLE_TIMEOUT_S, first_
 from bms_estimator.doctor.examine import examine
 from bms_estimator.doctor.finding import ExaminedPack, Finding, Level, fault
 from bms_estimator.doctor.systemd_unit import unit_of
-from bms_estimator.installation.root_command import root_command
+from bms_estimator.installation.machine import root_command
 from bms_estimator.model.errors import UserError
 
 DEFAULT_PACKS = (Path("pack.toml"), Path("/etc/bms-estimator/pack.toml"))

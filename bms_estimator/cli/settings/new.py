@@ -17,12 +17,12 @@ from bms_estimator.cli.options.output import compile_ahead, show_status
 from bms_estimator.cli.options.pack_options import decimal
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
 from bms_estimator.cli.settings.prompts import Prompts
-from bms_estimator.installation.root_command import root_command
+from bms_estimator.installation.machine import root_command
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import configure_logs
 from bms_estimator.service.kernel_warm_up import load_kernels
-from bms_estimator.settings.pack_file import require_new
+from bms_estimator.settings.pack import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.first_estimate import estimate_text, load_note, run_estimator

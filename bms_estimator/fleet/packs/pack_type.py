@@ -20,8 +20,8 @@ from bms_estimator.pack.pack import Pack, assemble
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.alarm_limits import monitored_alarms, short_limit_a
 from bms_estimator.settings.alarms import AlarmName
+from bms_estimator.settings.observer import NO_LIMITS
 from bms_estimator.settings.pack import PackSettings, Settings
-from bms_estimator.settings.sampling import NO_LIMITS
 from bms_estimator.telemetry.alarms.definitions import AlarmDefinitions
 from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from bms_estimator.estimator.stability_conditions import Condition, lemma_conditions
 from bms_estimator.kernels.cell_model.chen_mora import delta, emf
 from bms_estimator.model.cell import CellModel, generic_cells, load_cell
-from bms_estimator.reports.formats import number
+from bms_estimator.reports.report_parts import number
 from bms_estimator.reports.thesis import printed_pack, printed_values
 from bms_estimator.reports.thesis.report_items import Reproduction, Table
 from bms_estimator.reports.thesis.simulated_experiment import pack

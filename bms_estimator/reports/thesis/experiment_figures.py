@@ -11,7 +11,7 @@ import numpy as np
 
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
 from bms_estimator.plot.style import COLORS, FAINT, thin
-from bms_estimator.reports.svg_plot import plot
+from bms_estimator.reports.report_parts import plot
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.experiment import Experiment
 from bms_estimator.reports.thesis.observer_plots import crossing_plot, dynamic_static_plot, elements_plot, products_plot

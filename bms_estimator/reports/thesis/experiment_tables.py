@@ -9,7 +9,7 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.clean_capture import REST_C_RATE
 from bms_estimator.calibration.ocv.chen_mora_fit import average, chen_mora, max_v, pool_tests, rms_v
-from bms_estimator.reports.formats import number
+from bms_estimator.reports.report_parts import number
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.experiment import Experiment
 from bms_estimator.reports.thesis.procedure import KNEE_SOC, STATIC_SOC

@@ -11,7 +11,7 @@ import numpy as np
 from bms_estimator.kernels.cell_model.chen_mora import delta, emf, r_s
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports.svg_plot import plot
+from bms_estimator.reports.report_parts import plot
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.observer_plots import NO_VALUES, condition_plot, elements_plot, products_plot
 from bms_estimator.reports.thesis.report_items import Figure, Reproduction

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.reports.report_page import render
+from bms_estimator.reports.report_parts import render
 from bms_estimator.reports.thesis import (
     errata,
     experiment_figures,

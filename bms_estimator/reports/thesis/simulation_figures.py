@@ -14,7 +14,7 @@ from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
 from bms_estimator.model.arrays import Floats
 from bms_estimator.plot.style import COLORS, FAINT, thin
-from bms_estimator.reports.svg_plot import plot
+from bms_estimator.reports.report_parts import plot
 from bms_estimator.reports.thesis.bank_figure import LOAD_C, WEAK_SOC, BankExperiment
 from bms_estimator.reports.thesis.observer_plots import (
     NO_VALUES,

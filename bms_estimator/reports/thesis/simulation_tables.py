@@ -9,7 +9,7 @@ from bms_estimator.estimator.stability_conditions import lemma_conditions
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.reports.formats import number, percent
+from bms_estimator.reports.report_parts import number, percent
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.report_items import Reproduction, Table
 from bms_estimator.reports.thesis.simulation import (

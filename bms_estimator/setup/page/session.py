@@ -10,7 +10,7 @@ from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.service.kernel_warm_up import load_kernels
-from bms_estimator.settings.pack_file import require_new
+from bms_estimator.settings.pack import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
 from bms_estimator.setup.comparison import Comparison
 from bms_estimator.setup.first_estimate import run_estimator

@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Iterable
 from html import escape
 
-from bms_estimator.installation.root_command import root_command
+from bms_estimator.installation.machine import root_command
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.first_estimate import load_note

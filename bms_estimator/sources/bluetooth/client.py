@@ -1,11 +1,10 @@
-"""Bluetooth client of a BMS, with aiobmsble and bleak: scan, connect, poll and convert."""
+"""Bluetooth client of a BMS, with aiobmsble and bleak: scan, connect and poll."""
 
 import asyncio
 import logging
-import math
 import pkgutil
 from collections.abc import AsyncGenerator, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import aiobmsble.bms
 from aiobmsble.basebms import BaseBMS
@@ -14,41 +13,10 @@ from bleak import AdvertisementData, BleakScanner, BLEDevice
 from bleak.exc import BleakError
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.protocols.base.reading import CONNECTED, Reading, sample_json_line
-from bms_estimator.settings.sources.ble import BleSource
+from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
+from bms_estimator.settings.sources.linux import BleSource
+from bms_estimator.sources.bluetooth.bms_sample import convert_sample
 from bms_estimator.sources.source import LineProducer, SourceUnavailableError
-
-
-def convert_sample(sample: Mapping[str, Any]) -> Reading | None:
-    """Return the reading of aiobmsble's ``BMSSample``, positive on charge; None without voltage or current."""
-    voltage_v, current_a = _number(sample.get("voltage")), _number(sample.get("current"))
-    if math.isnan(voltage_v) or math.isnan(current_a):
-        return None
-    cells_v = tuple(_number(cell) for cell in sample.get("cell_voltages", ()))
-    soc, capacity_ah = _number(sample.get("battery_level")) / 100.0, _number(sample.get("design_capacity"))
-    return Reading(voltage_v, current_a, _temperatures_c(sample), cells_v, soc=soc, capacity_ah=capacity_ah)
-
-
-def _temperatures_c(sample: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the temperatures of the sensors on cells [degC].
-
-    Without such sensors return the temperature of the BMS, or those of all sensors.
-    """
-    sensors = sample.get("temp_values", ())
-    on_cells = [sensor for sensor in sensors if getattr(getattr(sensor, "type", None), "name", "") == "CELL"]
-    if not on_cells and "temperature" in sample:
-        return (_number(sample["temperature"]),)
-    return tuple(map(_number, on_cells or sensors))
-
-
-def _number(value: Any) -> float:
-    """Convert a value to a finite float; NaN if it is not one."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        return math.nan
-    return number if math.isfinite(number) else math.nan
-
 
 SCAN_S = 15.0
 """Timeout of a scan [s]. A BMS advertises every few seconds, but not while a phone is connected to it."""

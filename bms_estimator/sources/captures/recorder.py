@@ -11,7 +11,7 @@ from typing import Self
 
 import structlog
 
-from bms_estimator.process.daemon_thread import DaemonThreadExecutor
+from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 
 SYNC_S = 5.0

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from bms_estimator.model.decimal_text import number
-from bms_estimator.process.daemon_thread import DaemonThreadExecutor
+from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.linux import LinuxSource

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.sample import SampleBlock
-from bms_estimator.settings.sampling import BOARD
+from bms_estimator.settings.observer import BOARD
 from tests.benchmarks.recipes import Recipe, cell_file, load
 
 

@@ -13,7 +13,7 @@ from bms_estimator.model.payloads.health import AnchorReport
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.slow_fit import SlowFit
-from bms_estimator.settings.sampling import NO_LIMITS, ChargeLimits
+from bms_estimator.settings.observer import NO_LIMITS, ChargeLimits
 from bms_estimator.sources.captures.replay import load_capture
 from bms_estimator.telemetry.health import identifier_counters, last_anchor
 from tests.estimator.anywhere.cases import OXIDE

@@ -6,7 +6,7 @@ import numpy as np
 
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import Sampling
 from tests.estimator.month.topics import Topics, paired
 
 

@@ -5,8 +5,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.model.sample import SampleBlock, SampleStatus
-from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from bms_estimator.settings.sampling import EXACT, Sampling
+from bms_estimator.settings.observer import EXACT, IdentifierSettings, ObserverSettings, Sampling
 from tests.estimator.simulated_cell import TRUTH, measured, run_divided
 
 VOLTAGE_PERIOD = 10

@@ -5,8 +5,8 @@ import pytest
 from pydantic import ValidationError
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.settings.observer import Sampling
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sampling import Sampling
 from tests.estimator.simulated_cell import TRUTH, pulses
 
 

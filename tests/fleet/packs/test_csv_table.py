@@ -16,9 +16,8 @@ from bms_estimator.fleet.packs.pack_row import (
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import cell_text
-from bms_estimator.settings.observer import IdentifierSettings
+from bms_estimator.settings.observer import NO_LIMITS, ChargeLimits, IdentifierSettings
 from bms_estimator.settings.pack import PackSettings
-from bms_estimator.settings.sampling import NO_LIMITS, ChargeLimits
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import CORRECTIONS
 

@@ -9,7 +9,7 @@ from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, KINDS, SimulatedFleet
 from bms_estimator.model.cell import load_cell
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import Sampling
 
 BEGIN_NS = 1_800_000_000 * 10**9
 HOURS = 4

@@ -10,7 +10,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import TAUS
 from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL, apply_anchor, detect_anchor
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, LN_Q, NODE, NODES, OFFSET, SOC
 from bms_estimator.model.cell import load_cell
-from bms_estimator.settings.sampling import NO_LIMITS, ChargeLimits
+from bms_estimator.settings.observer import NO_LIMITS, ChargeLimits
 
 CAPACITY_AH = 2.0
 Phase = tuple[int, float, float]

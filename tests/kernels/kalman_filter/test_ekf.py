@@ -21,8 +21,7 @@ from bms_estimator.kernels.kalman_filter.mixture import merge_pair, mixture_mome
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE, SampleBlock
-from bms_estimator.settings.observer import IdentifierSettings
-from bms_estimator.settings.sampling import Sampling
+from bms_estimator.settings.observer import IdentifierSettings, Sampling
 from tests.estimator.anywhere.cases import CASES, Case, capture
 
 CELL = load_cell("nmc", 3.0)

@@ -16,8 +16,17 @@ from bms_estimator.demo.demo import DemoBroker
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.mqtt.client import DEFAULT_TIMEOUTS, Client
-from bms_estimator.mqtt.connection import Connection, ConnectOptions, DeliveryStats, Message, brokers, check
-from bms_estimator.mqtt.receive_queue import MAX_BYTES, MAX_WAITING, ReceiveQueue
+from bms_estimator.mqtt.connection import (
+    MAX_BYTES,
+    MAX_WAITING,
+    Connection,
+    ConnectOptions,
+    DeliveryStats,
+    Message,
+    ReceiveQueue,
+    brokers,
+    check,
+)
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import MAX_DELAY_S
 from bms_estimator.settings.outputs import MqttSettings

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.settings.pack import Settings
-from bms_estimator.sources.bluetooth.client import convert_sample
+from bms_estimator.sources.bluetooth.bms_sample import convert_sample
 from bms_estimator.sources.bluetooth.source import MIN_PYTHON_HEX
 from bms_estimator.sources.factory import open_source
 

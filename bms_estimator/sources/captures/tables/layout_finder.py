@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bms_estimator.model.cell_voltage_columns import present_columns
+from bms_estimator.model.columns import present_columns
 from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.sample import SAMPLE
