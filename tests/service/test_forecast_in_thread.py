@@ -15,7 +15,7 @@ from bms_estimator.kernels.forecast.observed_load import record_curves, simulate
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
-from bms_estimator.service import forecast_request
+from bms_estimator.service import request_handlers
 from bms_estimator.service.request_handlers import forecast_data, forecast_in_thread
 
 SAMPLES = np.zeros(800, SAMPLE)
@@ -50,7 +50,7 @@ async def test_samples_that_arrive_meanwhile_do_not_change_the_forecast(
         samples_processed.wait()
         return forecast_data(*arguments)
 
-    monkeypatch.setattr(forecast_request, "forecast_data", forecast_later)
+    monkeypatch.setattr(request_handlers, "forecast_data", forecast_later)
     response = asyncio.create_task(forecast_in_thread(forecaster, trip))
     await asyncio.sleep(0)  # the task takes its copy
     pack.run(SAMPLES[400:])
