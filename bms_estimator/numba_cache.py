@@ -60,7 +60,6 @@ COMPILED_SOURCES = (
         _PACKAGE / file
         for file in (
             "model/arrays.py",
-            "model/sample.py",
             "model/input_faults.py",
             "model/unmeasured_time.py",
             "protocols/base/relay.py",

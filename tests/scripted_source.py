@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.sources.source import ReceivedSamples
 from tests.patience import LONG_S
 

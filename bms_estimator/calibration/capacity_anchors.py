@@ -16,9 +16,9 @@ from bms_estimator.kernels.cell_model.chen_mora import ocv, soc_from_ocv
 from bms_estimator.kernels.cell_model.open_loop import hysteresis
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, REFERENCE_C, arrhenius, on_grid
 from bms_estimator.kernels.kalman_filter.hypotheses import HYST_STD
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.charge_count import MIN_GAP_PERIODS, step_charges_as
 from bms_estimator.model.columns import Columns
-from bms_estimator.model.sample import SampleBlock
 
 MAX_ANCHOR_SOC_STD = 0.1
 """Maximum std of an anchor's SOC."""

@@ -18,12 +18,11 @@ from bms_estimator.calibration.ocv.overpotential import overpotential
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock, SampleStatus
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.pack.pack import Pack
 
 GIVEN, FIRST_REST, UNDER_LOAD = "given", "first rest", "first sample under load"

@@ -9,9 +9,8 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import LONG_REST_S, ends_of_long_rests
 from bms_estimator.calibration.reference import reference_faults
 from bms_estimator.calibration.validate import LOW_SOC, SocErrors, Validation
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock, capture_digest
 from bms_estimator.model.cell import CellModel, Grade
-from bms_estimator.model.sample import SampleBlock, capture_digest
 
 GOOD_RMS_V = 0.010
 """Maximum RMS error of a good model, per cell [V]. Cell files that were fitted to captures of their own cell have 5 to

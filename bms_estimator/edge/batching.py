@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
+from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock
 
 MAX_SAMPLES = 7_000
 """Maximum number of samples in a block. A block of this many incompressible samples stays below

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from bms_estimator.edge import cell_voltages
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 
 _HEADER = struct.Struct("<4sBBHQQQd")
 _OLDEST_OFFSET = 24

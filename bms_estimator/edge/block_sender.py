@@ -22,9 +22,9 @@ from bms_estimator.edge.batching import MAX_SAMPLES, Batcher
 from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES
 from bms_estimator.edge.cell_voltages import MAX_CELLS
+from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.payloads.health import EdgeHealth
-from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, DeliveryStats, brokers, check
 from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop

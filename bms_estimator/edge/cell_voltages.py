@@ -15,7 +15,7 @@ import warnings
 
 import numpy as np
 
-from bms_estimator.model.sample import CellBlock
+from bms_estimator.model.arrays import CellBlock
 
 MAX_CELLS = 255
 """Maximum number of cells in series."""

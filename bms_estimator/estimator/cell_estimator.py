@@ -13,8 +13,7 @@ from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.kernels.cells.cell_filter import BIAS_V
 from bms_estimator.kernels.cells.records import BANK_STATE, CAPACITY, CELL, LEAK, RESISTANCE, SOC, STATES, ReadingFault
 from bms_estimator.kernels.cells.step import run_cells
-from bms_estimator.model.arrays import Floats, Records
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.arrays import CellBlock, Floats, Records, SampleBlock
 from bms_estimator.settings.alarm_limits import MIN_CELLS, balancing_voltage_v
 
 LEAK_STDS = 2.5

@@ -20,9 +20,9 @@ from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import (
     BOARD,
     EXACT,

@@ -12,8 +12,7 @@ import numpy as np
 
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE
-from bms_estimator.model.arrays import Record
-from bms_estimator.model.sample import SampleStatus
+from bms_estimator.model.arrays import Record, SampleStatus
 from bms_estimator.numba_cache import njit
 
 FOLLOWED_FRACTION = 0.2

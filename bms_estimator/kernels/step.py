@@ -22,8 +22,7 @@ from bms_estimator.kernels.observer.series_resistance import (
 )
 from bms_estimator.kernels.stability_margin import is_delta_configured, margin_with_std
 from bms_estimator.kernels.start import initialize_state, restart_after_unknown_gap, store_temperature
-from bms_estimator.model.arrays import Record, Records
-from bms_estimator.model.sample import SampleStatus
+from bms_estimator.model.arrays import Record, Records, SampleStatus
 from bms_estimator.numba_cache import njit
 
 

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import CellBlock
+from bms_estimator.model.arrays import CellBlock, Floats
 
 MIN_LIVE_V, MAX_LIVE_V = 0.1, 6.0
 """Range of the absolute voltage of a live cell [V]. Empty slots read 0 V, a few millivolts of noise, or the largest number of

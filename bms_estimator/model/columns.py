@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.sample import CellBlock
+from bms_estimator.model.arrays import CellBlock
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,9 +17,8 @@ from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows, po
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.load_history import restore_load
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import NO_CELLS, NO_SOC, CellBlock, Floats, SampleBlock
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.model.sample import NO_CELLS, NO_SOC, CellBlock, SampleBlock
 from bms_estimator.pack.state import (
     CAPACITY,
     CELLS,

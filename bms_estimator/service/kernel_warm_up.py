@@ -11,8 +11,8 @@ from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import fit

@@ -8,9 +8,8 @@ import numpy as np
 from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.bank_simulation import STATE, simulate
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings
 
 

@@ -8,8 +8,8 @@ from typing import Self
 
 import numpy as np
 
+from bms_estimator.model.arrays import NO_SOC, SampleStatus
 from bms_estimator.model.clock import since_boot
-from bms_estimator.model.sample import NO_SOC, SampleStatus
 from bms_estimator.sources.serial.serial_source import SerialSource
 from bms_estimator.sources.source import LineSource, ReceivedSamples
 

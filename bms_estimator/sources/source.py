@@ -10,9 +10,8 @@ from typing import NamedTuple, Protocol, Self
 
 import structlog
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import NO_PROBES, NO_SOC, CellBlock, Floats, ProbeBlock, SampleBlock
 from bms_estimator.model.clock import since_boot
-from bms_estimator.model.sample import NO_PROBES, NO_SOC, CellBlock, ProbeBlock, SampleBlock
 from bms_estimator.process.runtime import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_protocol

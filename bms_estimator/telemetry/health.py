@@ -12,6 +12,7 @@ from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.kernels.kalman_filter.anchors import FULL, NO_ANCHOR
 from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.health import (
@@ -25,7 +26,6 @@ from bms_estimator.model.payloads.health import (
     RecordingHealth,
     Totals,
 )
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack_model.history import DAY_S
 from bms_estimator.pack_model.slow_fit import SlowFit

@@ -18,10 +18,10 @@ from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS, accumulate_charge_energy
 from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, accumulate_window
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
+from bms_estimator.model.arrays import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Totals
-from bms_estimator.model.sample import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock
 from bms_estimator.telemetry.health import sample_counters
 
 

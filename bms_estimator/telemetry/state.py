@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from bms_estimator.forecast.available_power import FORECAST, Forecast, unknown_values
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, ProbeBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import PAYLOAD_VERSION
 from bms_estimator.model.payloads.snapshot import ForecastReport, Info
-from bms_estimator.model.sample import ProbeBlock
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.publish_window import ChargeEnergy, WindowSummary
 from bms_estimator.version import __version__

@@ -20,9 +20,8 @@ from bms_estimator.kernels.kalman_filter.hypotheses import MAX_STD_OF_ONE_HYPOTH
 from bms_estimator.kernels.kalman_filter.mixture import mixture_moments
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import SOC
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
 from tests.estimator.anywhere.score import Score, score
 

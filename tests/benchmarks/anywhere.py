@@ -31,9 +31,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings
 from tests.benchmarks.ekf import FIVE_TAU_S, five_branches, fixed_ekf, ladder_ekf
 from tests.benchmarks.pulses import pulse_table

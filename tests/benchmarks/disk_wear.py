@@ -19,9 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import SAMPLE, Floats
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, VOLTAGE_STEP_V
 from tests.benchmarks.table import Row, show
 from tests.benchmarks.wire import hello, sample_frames

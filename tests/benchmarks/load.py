@@ -3,8 +3,8 @@
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 CELL = "thunder_power_6s"
 RATE_HZ = 100

@@ -15,8 +15,7 @@ from rich.table import Table
 from scipy.ndimage import median_filter
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import Floats, SampleBlock
 from tests.benchmarks.recipes import FROM_START, GROUPS, SOC_ERRORS, Group, cell_file, chosen, load
 
 MIN_C = 0.2

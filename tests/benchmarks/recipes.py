@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.sources.captures.replay import load_capture
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -16,9 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.recipes import GROUPS, chosen, runs
 from tests.estimator.anywhere.score import score
 

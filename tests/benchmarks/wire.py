@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.framing import MESSAGE_SAMPLE, SAMPLE_BYTES, SAMPLE_FRAME_BYTES, crc16
 from bms_estimator.protocols.firmware.messages import PROTOCOL_VERSION, Hello

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bms_estimator.calibration.ocv.chen_mora_fit import chen_mora
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.reports.thesis.printed_values import TABLE_1
 
 CAPACITY_AH = 3.0

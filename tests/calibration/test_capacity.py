@@ -8,10 +8,10 @@ import pytest
 
 from bms_estimator.calibration.capacity import Capacity, measure_capacity
 from bms_estimator.calibration.capacity_anchors import continuous_parts
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, Case, Truth, cell_file
 from tests.estimator.anywhere.truth import simulate
 

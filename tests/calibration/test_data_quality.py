@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.cleaning.data_quality import data_quality
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 
 
 @pytest.fixture

@@ -3,10 +3,9 @@
 import numpy as np
 
 from bms_estimator.calibration.validate import validate
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import SAMPLE, Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
-from bms_estimator.model.sample import SAMPLE
 
 INITIAL_SOC = 0.95
 STEP_S = 1.0

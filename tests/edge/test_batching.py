@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.edge.batching import Batcher
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 
 
 def samples_at(times_s: np.ndarray) -> SampleBlock:

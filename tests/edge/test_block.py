@@ -22,7 +22,7 @@ from bms_estimator.edge.block import (
     peek_probes,
 )
 from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleBlock
 
 
 def samples(count: int = 60) -> SampleBlock:

@@ -18,7 +18,7 @@ from bms_estimator.edge.block import Block, decode
 from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES, NS_PER_S
 from bms_estimator.edge.subjects import BlockRequest
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.store.database import Database
 from tests.patience import LONG_S, until
 

@@ -7,7 +7,7 @@ from bms_estimator.edge.batching import MAX_SAMPLES, Batcher
 from bms_estimator.edge.block import Block, BlockError, decode, encode
 from bms_estimator.edge.cell_voltages import MAX_BYTES
 from bms_estimator.fleet.nats.streams import MAX_BLOCK_BYTES
-from bms_estimator.model.sample import NO_CELLS, SAMPLE
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 
 STORE_ID_NS = 10**18
 

@@ -7,8 +7,8 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
 
 TRUTH = load_cell("chen_mora").model_copy(update={"adaptation": {}})

@@ -9,8 +9,8 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 TRUTH = load_cell("ncr18650").model_copy(update={"ladder": None})
 """True cell. It has no RC ladder, because it is simulated with the two RC pairs of its file."""

@@ -5,9 +5,9 @@ import pytest
 
 from bms_estimator import Estimator
 from bms_estimator.kernels.step import SampleOutcome
+from bms_estimator.model.arrays import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 from tests.estimator.simulated_cell import TRUTH, measured, pulses, run_divided
 
 WRAPPED_A = {"0.1 A": 6553.6, "0.01 A": 655.36, "unsigned, offset 3000 A": 3556.5}

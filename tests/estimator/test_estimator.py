@@ -9,8 +9,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import SAMPLE_OUTCOMES
 from bms_estimator.estimator.stability_conditions import failed_conditions, lemma_conditions
 from bms_estimator.kernels.step import SampleOutcome
+from bms_estimator.model.arrays import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.model.cell import load_cell, shipped_cells
-from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.settings.observer import ObserverSettings
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from tests.estimator.simulated_cell import pulses, run_divided

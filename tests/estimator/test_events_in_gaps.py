@@ -8,10 +8,9 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.hypotheses import spawn_after_gap, spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, NODE, Noise
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import TableOcv, load_cell
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import Sampling
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, Capture, Case, capture
 from tests.estimator.anywhere.cycles import Cycle, true_curve

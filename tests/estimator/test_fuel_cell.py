@@ -9,8 +9,8 @@ from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.cli.captures.replay_summary import Summary
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.pack_model import load_fuel_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters

@@ -10,7 +10,7 @@ from bms_estimator.kernels.identifier import set_adaptation_targets
 from bms_estimator.kernels.kalman_filter.element_map import CAPACITANCES, ELEMENTS
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.records import LN_Q, OFFSET, SOC
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from tests.estimator.simulated_cell import TRUTH, pulses, run_divided, wrong_cell
 

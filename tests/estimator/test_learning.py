@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.parameters import make_parameters_payload

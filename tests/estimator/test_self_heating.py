@@ -9,8 +9,8 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.kernels.kalman_filter.temperature import COOLING_S, MAX_MODELLED_C
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.replay import load_capture
 
 HALF_C_CAPTURE = Path(__file__).parents[1] / "data" / "lgm50" / "rate_0p5c_25c.csv.gz"

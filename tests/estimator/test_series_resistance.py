@@ -15,8 +15,7 @@ from bms_estimator.checkpoint.arrays_file import without_observer
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.observer.series_resistance import BINS, MAX_SAMPLES
-from bms_estimator.model.arrays import fields
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock, fields
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from tests.calibration.simulated_load import TRUTH, capture, steps

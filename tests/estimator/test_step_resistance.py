@@ -6,8 +6,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S
 from bms_estimator.kernels.kalman_filter.records import LN_R0
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock
 from tests.estimator.anywhere.cases import OXIDE, Case, cell_file
 from tests.estimator.anywhere.truth import simulate
 

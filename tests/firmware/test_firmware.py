@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.model.sample import SampleStatus
+from bms_estimator.model.arrays import SampleStatus
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import (
     PROTOCOL_VERSION,

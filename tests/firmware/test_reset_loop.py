@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
+from bms_estimator.model.arrays import SampleStatus
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.model.sample import SampleStatus
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import MessageType, command
 from bms_estimator.service import relay_hook

@@ -5,8 +5,8 @@ import numpy as np
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.worker.block_result import BlockResult
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import PackSettings, Settings
 
 STORE_ID_NS = 480_000 * 3600 * 10**9

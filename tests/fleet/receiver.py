@@ -12,7 +12,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, decode
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.process.runtime import end
 from tests.fleet.nats_cluster import connected
 from tests.patience import LONG_S

@@ -14,7 +14,7 @@ from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.settings.fleet import TenantSettings
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.patience import LONG_S

@@ -25,7 +25,7 @@ from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from tests.command_line import PROGRAM
 from tests.fleet.partition_stream import estimates_of
 from tests.patience import LONG_S

@@ -17,8 +17,8 @@ from bms_estimator.forecast.available_power import (
 )
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.settings.pack import Settings
 from tests.estimator.simulated_cell import TRUTH

@@ -16,8 +16,8 @@ from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES, TA
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.kernels.kalman_filter.records import STATES
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from tests.estimator.anchors.chargers import CAPACITY_AH, SERIES, Charged, Meter
 from tests.estimator.simulated_cell import TRUTH, measured
 

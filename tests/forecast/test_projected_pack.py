@@ -8,7 +8,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.forecast.capability import projected_pack
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.forecast.projected_pack import FAST_RESISTANCES, GROWTH, SURFACE_S
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 from tests.estimator.simulated_cell import TRUTH
 from tests.forecast.simulated_load import CUTOFF_V
 

@@ -8,9 +8,9 @@ import pytest
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import MAX_TRIP_S, TripOutcome, constant_trip, profile_trip, trip_outcome
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.settings.pack import PackSettings, Settings
 

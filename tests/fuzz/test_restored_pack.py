@@ -17,9 +17,8 @@ from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.cells.records import BANK_STATE
 from bms_estimator.kernels.cells.records import CELL as CELL_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
-from bms_estimator.model.arrays import fields
+from bms_estimator.model.arrays import SAMPLE, fields
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import slow_fit as slow_fit_module

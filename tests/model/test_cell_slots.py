@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from bms_estimator.model.arrays import NO_CELLS
 from bms_estimator.model.cell_slots import CellSlots
-from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.protocols.base.reading_protocol import cell_block
 
 NAN = np.nan

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.model.arrays import fields
+from bms_estimator.model.arrays import SAMPLE, fields
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack.state import PackState
 from bms_estimator.pack_model import slow_fit as slow_fit_module

@@ -11,7 +11,7 @@ from bms_estimator.kernels.accumulators.history import (
     REST_GROWTH,
     ROW_SOC,
 )
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.observer import Sampling

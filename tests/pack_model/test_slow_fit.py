@@ -11,9 +11,9 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.estimator.fitted_state import FILTER_STATES
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC
+from bms_estimator.model.arrays import SampleBlock, SampleStatus
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SampleBlock, SampleStatus
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import slow_fit as slow_fit_module

@@ -22,11 +22,11 @@ import structlog
 from bms_estimator.checkpoint.run_file import RunCounters, add_checksum
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.snapshot import Alarm
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.process.state_folder import instance_lock
 from bms_estimator.protocols.base.relay import Relay

@@ -12,8 +12,8 @@ from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import Trip, constant_trip
 from bms_estimator.kernels.forecast.given_load import simulate_given_load
 from bms_estimator.kernels.forecast.observed_load import record_curves, simulate_observed_load
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.service import request_handlers
 from bms_estimator.service.request_handlers import forecast_data, forecast_in_thread

@@ -16,12 +16,12 @@ from structlog.testing import capture_logs
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import compiled_estimator
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.process.runtime import SystemdNotifier

@@ -16,12 +16,11 @@ from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
-from bms_estimator.model.arrays import fields
+from bms_estimator.model.arrays import NO_CELLS, SampleBlock, fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.events import events
 from bms_estimator.model.payloads.health import PackModelHealth
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.model.sample import NO_CELLS, SampleBlock
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model import fit as fit_module

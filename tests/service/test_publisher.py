@@ -5,10 +5,10 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings

@@ -8,8 +8,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.checkpoint.state_files import StateFiles
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.settings.pack import Settings

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import NO_CELLS
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.slow_fit import SlowFit

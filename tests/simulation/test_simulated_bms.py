@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.bms_responses import BMS_RESPONSES
 from bms_estimator.simulation.simulated_bms import MAX_CELL_DEVIATION_V, BmsFault, SimulatedBms

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.model.arrays import SampleBlock, SampleStatus
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameCounters, FrameDecoder
 from bms_estimator.protocols.firmware.messages import (

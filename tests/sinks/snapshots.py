@@ -4,12 +4,12 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.available_power import Forecast, ForecastCurve, unknown_values
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.pack_model import PackModel, load_fuel_cell
 from bms_estimator.model.payloads.health import LoopHealth
 from bms_estimator.model.payloads.snapshot import Alarm, CellReport, CellsReport, Snapshot
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.cells import remaining_capacity_ah

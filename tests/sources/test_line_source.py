@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sensor import SensorSettings

@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.kernels.alarms.quantities import update_quantities
 from bms_estimator.kernels.alarms.records import ALARMS, EVALUATION_IO, LIMITS, LOG, NAMES, SETTINGS, TEMPERATURE
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.telemetry.alarms.definitions import decode
 
 

@@ -17,12 +17,12 @@ from bms_estimator.kernels.alarms.records import EVALUATION_IO, LIMITS, LOG, RAI
 from bms_estimator.kernels.alarms.states import acknowledge
 from bms_estimator.kernels.cells.records import ReadingFault
 from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.events import events
 from bms_estimator.model.pack_model import load_fuel_cell
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.protocols.base.device_clock import MAX_LEAD_S
 from bms_estimator.protocols.base.probe_check import probe_block
 from bms_estimator.settings.alarm_limits import implausible_limits, monitored_alarms

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.protocols.base.reading import sample_json_line
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
 from bms_estimator.telemetry.impossible import PackBounds

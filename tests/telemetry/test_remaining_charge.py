@@ -8,9 +8,8 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.cell_model import chen_mora
-from bms_estimator.model.arrays import fields
+from bms_estimator.model.arrays import SAMPLE, fields
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.health import identifier_counters, suspicions

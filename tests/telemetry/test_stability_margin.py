@@ -6,10 +6,10 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock, make_estimator
 from bms_estimator.kernels.cell_model.chen_mora import delta
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.pack_model import load_model
 from bms_estimator.model.payloads.estimate import Estimate
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator

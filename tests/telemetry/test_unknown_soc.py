@@ -8,8 +8,8 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.payloads.snapshot import Alarm
-from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.telemetry.alarms.alarm_list import NO_VALUE
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC

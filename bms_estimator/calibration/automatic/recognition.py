@@ -26,11 +26,11 @@ from bms_estimator.calibration.ocv.relaxation_test import MIN_POINTS, Relaxation
 from bms_estimator.calibration.ocv.slow_branch import SlowBranch, measured_capacity_ah, slow_branches
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 MAX_PULSE_S = 60.0
 """Maximum duration of a pulse [s]. The pulses of an HPPC test last 10 to 30 s."""

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 MIN_STEP = 0.1
 """Minimum change of the current at a step, as a fraction of the largest current."""

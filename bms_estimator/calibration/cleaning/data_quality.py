@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.charge_count import gap_s
-from bms_estimator.model.sample import SampleBlock
 
 ROUNDING_FRACTION = 1e-6
 """Difference of two values that counts as rounding, as a fraction of the largest magnitude."""

@@ -35,11 +35,10 @@ from bms_estimator.estimator.filter_settings import CURVE_ERROR_SOC, CURVE_ERROR
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import HIGH_ACTIVATION_ENERGY, RESISTANCES, weak_share
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import LN_TAUS, SHORT_PAIRS
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import SAMPLE, Floats
 from bms_estimator.model.cell import Capacitance, CellModel, Ladder, Resistance, TableOcv
 from bms_estimator.model.charge_count import step_charges_as
 from bms_estimator.model.progress import Progress, no_progress
-from bms_estimator.model.sample import SAMPLE
 
 START_FRACTIONS = (0.2, 0.5)
 """Fractions of the capture's charge throughput at which replays start."""

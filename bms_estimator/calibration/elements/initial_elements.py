@@ -11,9 +11,9 @@ from scipy.optimize import nnls
 
 from bms_estimator.calibration.cleaning.clean_capture import are_mismatched, remove_glitches
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import Capacitance, Resistance
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 SHORT_TAUS = np.geomspace(0.003, 0.05, 12)
 """Candidate time constants of the short RC pair, as fractions of the rest's duration."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.model.sample import CellBlock, SampleBlock
+from bms_estimator.model.arrays import CellBlock, SampleBlock
 
 WINDOW_S = 1.0
 """Minimum duration of the samples of a mean [s]."""

@@ -10,8 +10,8 @@ from enum import StrEnum
 
 from bms_estimator.calibration.guided_test.averages import Average, Averager
 from bms_estimator.calibration.guided_test.plan import Limits, Plan
+from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.model.cell_slots import CellSlots
-from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 
 MIN_LOAD_C_RATE = 0.1
 """Minimum C-rate of a load that determines resistances [1/h]."""

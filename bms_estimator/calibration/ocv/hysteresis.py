@@ -12,8 +12,7 @@ from bms_estimator.calibration.ocv.slow_branch import SlowBranch
 from bms_estimator.calibration.ocv.slow_curve import GRID
 from bms_estimator.calibration.ocv.table_fit import NODES
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, REFERENCE_C, arrhenius
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import Floats, SampleBlock
 
 
 @dataclass(frozen=True)

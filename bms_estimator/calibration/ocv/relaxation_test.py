@@ -19,9 +19,8 @@ from bms_estimator.calibration.cleaning.clean_capture import (
     true_runs,
     with_matched_voltages,
 )
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 MIN_REST_S = 30.0
 """Minimum duration of a rest [s]. A shorter rest shows only the ohmic step."""

@@ -14,10 +14,9 @@ from bms_estimator.calibration.cleaning.clean_capture import (
     true_runs,
     with_matched_voltages,
 )
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.charge_count import are_long_gaps, charge_ah
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 MIN_DURATION_S = 7.0 * 3600.0
 """Minimum duration of a low-rate curve [s]. A full curve at C/7 takes this long. Faster curves deviate too much from the OCV:

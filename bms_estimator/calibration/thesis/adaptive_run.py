@@ -18,9 +18,8 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, delta, min_stable_exponent
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 SETTLED_FRACTION = 0.99
 """Minimum fraction of the samples after t_int whose error is within its bound."""

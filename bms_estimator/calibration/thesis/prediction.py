@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.cleaning.clean_capture import remove_glitches, soc_by_counting
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv_of_each, r_s, r_tl, r_ts, simulate_cell
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 
 GRID = np.linspace(0.0, 1.0, 4001)
 """SOC grid on which E_o(SOC) is inverted."""

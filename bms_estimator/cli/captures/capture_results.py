@@ -11,12 +11,11 @@ from bms_estimator.calibration.verdict import is_fitted_to
 from bms_estimator.cli.options.capture_options import read_with_bar
 from bms_estimator.cli.options.output import compile_ahead, progress_bar
 from bms_estimator.estimator.identified_parameters import relative_capacity
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock, fill_temperature
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
-from bms_estimator.model.sample import SampleBlock, fill_temperature
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.plot.style import kept_indices
 from bms_estimator.reports.capture_report import CaptureResult, Estimates

@@ -23,12 +23,11 @@ from bms_estimator.cli.options.capture_options import (
     print_guesses,
     print_warnings,
 )
-from bms_estimator.model.arrays import Records, structured_array
+from bms_estimator.model.arrays import SAMPLE, Records, SampleBlock, structured_array
 from bms_estimator.model.charge_count import TimeFaults
 from bms_estimator.model.columns import cell_voltage_columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.sinks.trace_file import SINKS, CsvSink, TableSink, join_columns, table_sink
 from bms_estimator.sources.captures.replay import Capture, no_samples_error, open_capture
 

@@ -31,12 +31,11 @@ from bms_estimator.cli.options.capture_options import (
 from bms_estimator.cli.options.pack_options import decimal, load_pack, pack_or_cell, with_pack
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.identified_parameters import present_elements, relative_capacity
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import CurrentSign, Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.pack_model.aging_course import aging_course
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.saved import history_from_arrays

@@ -24,9 +24,9 @@ from bms_estimator.cli.options.capture_options import (
 )
 from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.cli.options.pack_options import LABORATORY_RESOLUTION_V, decimal
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.reports.thesis import report_items
 from bms_estimator.reports.thesis.experiment import RecordedCaptures
 from bms_estimator.reports.thesis.report import LONG_CELL, Report, build, write

@@ -28,8 +28,7 @@ from bms_estimator.cli.options.capture_options import (
 )
 from bms_estimator.cli.options.output import compile_ahead, progress_bar
 from bms_estimator.cli.options.pack_options import decimal, pack_or_cell, with_pack
-from bms_estimator.model.arrays import Records, structured_array
-from bms_estimator.model.sample import fill_temperature
+from bms_estimator.model.arrays import Records, fill_temperature, structured_array
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.sinks.trace_file import table_sink
 from bms_estimator.telemetry.state import finite

@@ -40,10 +40,10 @@ from bms_estimator.cli.options.capture_options import (
 )
 from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.cli.options.pack_options import decimal, whole
+from bms_estimator.model.arrays import capture_digest, fill_temperature
 from bms_estimator.model.cell import fitted_to
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.pack_model import write_cell
-from bms_estimator.model.sample import capture_digest, fill_temperature
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.replay import load_capture

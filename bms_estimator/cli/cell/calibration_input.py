@@ -7,10 +7,10 @@ from pathlib import Path
 from bms_estimator.calibration.ocv.hysteresis import ExternalCurve
 from bms_estimator.cli.options.capture_options import load_captures, unique_names
 from bms_estimator.cli.options.pack_options import single_cell_of, with_pack
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.sources.captures.curves import read_curve
 from bms_estimator.sources.captures.tables.layout import ColumnMap

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import read_capture
 from bms_estimator.sources.captures.replay import RawCapture

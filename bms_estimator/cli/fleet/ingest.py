@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
-from bms_estimator.model.sample import CurrentSign
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 

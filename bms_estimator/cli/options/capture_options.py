@@ -16,13 +16,13 @@ import typer
 
 from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.cli.options.pack_options import decimal, whole
+from bms_estimator.model.arrays import CurrentSign, SampleBlock, capture_digest
 from bms_estimator.model.cell import CellModel, battery_names, cell_names, fitted_to, with_name
 from bms_estimator.model.charge_count import TimeFaults, gap_warnings
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import write_cell
 from bms_estimator.model.progress import Progress, no_progress
-from bms_estimator.model.sample import CurrentSign, SampleBlock, capture_digest
 from bms_estimator.sources.captures.replay import Capture, open_capture, read_samples
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map

@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from bms_estimator.edge.cell_voltages import MAX_CELLS
 from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values, check_count
 from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S
-from bms_estimator.model.clock import iso_utc
-from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import (
+from bms_estimator.model.arrays import (
     MAX_CELL_V,
     MIN_CELL_V,
     NO_CELLS,
@@ -23,6 +21,8 @@ from bms_estimator.model.sample import (
     SampleBlock,
     remove_implausible,
 )
+from bms_estimator.model.clock import iso_utc
+from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind, Unit, date_order, find_unit, split_unit
 from bms_estimator.sources.captures.tables.column_tables import parse_column
 from bms_estimator.sources.captures.tables.layout import (

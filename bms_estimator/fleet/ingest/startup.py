@@ -17,8 +17,8 @@ from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, close, connect, error_text
 from bms_estimator.fleet.nats.streams import make_telemetry_stream, partitions_of
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.process.runtime import end, until_first_ends
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 

@@ -11,7 +11,7 @@ from nats.aio.client import Client
 from bms_estimator.edge.block import EXTREMES, Block, BlockError, decode, peek_cells, peek_probes
 from bms_estimator.edge.subjects import RAW_STREAM
 from bms_estimator.fleet.nats.stream_reader import read_stream
-from bms_estimator.model.sample import SAMPLE, CellBlock, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, CellBlock, SampleBlock
 
 MAX_CLOCK_LEAD_S = 3600.0
 """Maximum lead of an edge's clock over the server's clock [s]. A block may be stored this long before the time of its

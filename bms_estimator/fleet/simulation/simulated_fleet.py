@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 
 Ints = NDArray[np.int64]
 Bits = NDArray[np.uint64]

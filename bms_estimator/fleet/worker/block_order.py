@@ -24,7 +24,7 @@ from bms_estimator.edge.batching import MAX_SAMPLES as EDGE_MAX_SAMPLES
 from bms_estimator.edge.block import Block, BlockHeader
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.worker.pack_state import MAX_LOST_BLOCKS
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 
 MAX_RATE_HZ = 1000.0
 """Maximum sample rate of a source [Hz]."""

@@ -31,10 +31,9 @@ from bms_estimator.fleet.worker.pack_state import (
 from bms_estimator.forecast.available_power import Forecast, unknown_values
 from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.kernels.cells.records import BANK_STATE, CELL
-from bms_estimator.model.arrays import fields
+from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock, fields
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.health import Payload
-from bms_estimator.model.sample import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.pack.state import CHECKPOINT, REFUSED, PackState
 from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload, remaining_capacity_ah
 from bms_estimator.telemetry.parameters import make_parameters_payload

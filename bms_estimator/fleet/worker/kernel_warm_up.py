@@ -7,8 +7,8 @@ import numpy as np
 
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.service.kernel_warm_up import CELL, load_kernels
 from bms_estimator.settings.alarm_limits import MIN_CELLS
 from bms_estimator.settings.pack import Settings

@@ -16,11 +16,11 @@ from bms_estimator.fleet.worker.block_result import AlarmMessage
 from bms_estimator.kernels.alarms.evaluate import begin_time_base, mark_reported
 from bms_estimator.kernels.alarms.quantities import lost_quantities
 from bms_estimator.kernels.alarms.records import COUNTS, ENDED, NAMES, RAISED, WATCH_CHANGED
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock, SampleBlock, SampleStatus
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.events import Event, EventText, fit_event, input_fault_events, soc_events, watch_events
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, CellBlock, SampleBlock, SampleStatus
 from bms_estimator.telemetry.alarms.causes import LOSS_TEXTS, PROBE_TEXT, WRONG_CLOCK_TEXT, find_unknown, suspect_texts
 from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIES, SENSOR_SUSPECTS, EvaluationKernel
 from bms_estimator.telemetry.alarms.message import AlarmMessage as AlarmContent

@@ -40,8 +40,7 @@ from bms_estimator.kernels.alarms.values import (
     possible_values,
     uncertain_values,
 )
-from bms_estimator.model.arrays import Floats, Record, Records
-from bms_estimator.model.sample import SampleStatus
+from bms_estimator.model.arrays import Floats, Record, Records, SampleStatus
 from bms_estimator.numba_cache import njit
 
 CELLS_GAP_S = 60.0

@@ -7,8 +7,7 @@
 import math
 
 from bms_estimator.kernels.alarms.records import CELLS, CURRENT, LINK_LOST, QUANTITIES, TEMPERATURE, VOLTAGE
-from bms_estimator.model.arrays import Floats, Record
-from bms_estimator.model.sample import MAX_CELL_V, SampleStatus
+from bms_estimator.model.arrays import MAX_CELL_V, Floats, Record, SampleStatus
 from bms_estimator.numba_cache import njit
 
 MIN_MEAN_V = -1.0

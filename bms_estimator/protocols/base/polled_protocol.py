@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
-from bms_estimator.model.sample import CurrentSign
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, DeviceProtocol, ReadingProtocol
 from bms_estimator.protocols.base.sensor_correction import SensorCorrection

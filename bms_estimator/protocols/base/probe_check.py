@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import MAX_C, MIN_C, NO_PROBES, PROBE, ProbeBlock, SampleBlock, SampleStatus
+from bms_estimator.model.arrays import MAX_C, MIN_C, NO_PROBES, PROBE, Floats, ProbeBlock, SampleBlock, SampleStatus
 
 STEP_K = 30.0
 """Change of a probe that is accepted at once [K]. The delays of the alarms suppress single glitches of this size."""

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import (
+from bms_estimator.model.arrays import (
     MAX_CELL_V,
     MIN_CELL_V,
     NO_CELLS,
@@ -19,10 +17,12 @@ from bms_estimator.model.sample import (
     SAMPLE,
     CellBlock,
     CurrentSign,
+    Floats,
     ProbeBlock,
     SampleBlock,
     remove_implausible,
 )
+from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.probe_check import ProbeCheck, probe_block
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.relay import Relay

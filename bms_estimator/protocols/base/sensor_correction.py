@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 
 
 class SensorCorrection(NamedTuple):

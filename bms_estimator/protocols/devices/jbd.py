@@ -9,7 +9,7 @@ import re
 import struct
 from collections.abc import Sequence
 
-from bms_estimator.model.sample import CurrentSign
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.protocols.base.polled_protocol import (
     MAX_ATTACHED_AGE_S,
     Device,

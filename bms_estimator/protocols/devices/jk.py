@@ -15,7 +15,7 @@ import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 
-from bms_estimator.model.sample import CurrentSign
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.protocols.base.polled_protocol import Device, ParseResult, PolledProtocol, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
 

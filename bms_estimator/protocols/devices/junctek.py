@@ -9,8 +9,8 @@ same line; its responses are used as well.
 import math
 from collections.abc import Iterator
 
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.decimal_text import PRINTABLE
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.polled_protocol import Device, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, ReadingProtocol

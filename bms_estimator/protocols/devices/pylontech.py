@@ -13,8 +13,8 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.decimal_text import PRINTABLE
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.polled_protocol import Device, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol, RecentCellVoltages

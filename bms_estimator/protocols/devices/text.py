@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bms_estimator.model.decimal_text import PRINTABLE
-from bms_estimator.model.sample import (
+from bms_estimator.model.arrays import (
     MAX_CELL_V,
     MIN_CELL_V,
     SAMPLE,
@@ -15,6 +14,7 @@ from bms_estimator.model.sample import (
     SampleStatus,
     remove_implausible,
 )
+from bms_estimator.model.decimal_text import PRINTABLE
 from bms_estimator.protocols.base.device_clock import DeviceClock
 from bms_estimator.protocols.base.polled_protocol import Device, SensorDefaults
 from bms_estimator.protocols.base.probe_check import ProbeCheck

@@ -11,8 +11,8 @@ import re
 from collections.abc import Iterator, Mapping
 from math import nan
 
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.decimal_text import number
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.protocols.base.polled_protocol import Device, SensorDefaults
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.reading_protocol import ReadingProtocol

@@ -8,8 +8,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import SAMPLE, CurrentSign, SampleBlock
 from bms_estimator.model.decimal_text import PRINTABLE
-from bms_estimator.model.sample import SAMPLE, CurrentSign, SampleBlock
 from bms_estimator.protocols.firmware.clock_drift import clock_ppm
 from bms_estimator.protocols.firmware.framing import DECODER, HELLO_BYTES, PACKET_BYTES, SAMPLE_FRAME_BYTES, decode
 from bms_estimator.protocols.firmware.messages import (

@@ -12,8 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Record, Records
-from bms_estimator.model.sample import MAX_C, MIN_C, SampleStatus
+from bms_estimator.model.arrays import MAX_C, MIN_C, Record, Records, SampleStatus
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.clock_drift import CLOCK_WINDOWS, add_arrival, reset_clock_estimate
 from bms_estimator.protocols.firmware.messages import MODULUS, PROTOCOL_VERSION, BoardStatus, MessageType

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import CurrentSign, SampleBlock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import CurrentSign, SampleBlock
 from bms_estimator.protocols.base.probe_check import ProbeCheck
 from bms_estimator.protocols.base.reading_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay

@@ -12,10 +12,9 @@ from functools import cached_property
 import numpy as np
 
 from bms_estimator.calibration.elements.initial_elements import initial_elements
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.procedure import Capture, Kind, Procedure, kind_of
 from bms_estimator.reports.thesis.report_items import Reproduction

@@ -33,10 +33,9 @@ from bms_estimator.calibration.thesis.series_resistance import (
     series_resistance,
 )
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
 
 LOWEST_SOC = 0.05

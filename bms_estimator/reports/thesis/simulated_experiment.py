@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, terminal_voltage
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.procedure import Capture, Kind
 

@@ -11,11 +11,19 @@ from typing import Protocol, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import (
+    NO_PROBES,
+    NO_SOC,
+    SAMPLE,
+    CellBlock,
+    CurrentSign,
+    Floats,
+    ProbeBlock,
+    SampleBlock,
+)
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.progress import Progress, no_progress
-from bms_estimator.model.sample import NO_PROBES, NO_SOC, SAMPLE, CellBlock, CurrentSign, ProbeBlock, SampleBlock
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.capture_records import RECORD_OVERHEAD_BYTES

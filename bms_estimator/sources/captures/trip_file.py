@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from bms_estimator.forecast.trip import LoadQuantity, Trip, profile_trip
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.captures.replay import Capture, open_capture, read_samples
 from bms_estimator.sources.captures.tables.cell_values import MAX_TEXT_CHARACTERS, parse_number, uses_decimal_comma
 from bms_estimator.sources.captures.tables.layout import ColumnMap

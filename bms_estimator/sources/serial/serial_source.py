@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Self
 
 import structlog
 
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.process.runtime import FIRST_RETRY_S
 from bms_estimator.protocols.base.reading_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay

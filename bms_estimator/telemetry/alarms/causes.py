@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from bms_estimator.model.arrays import ProbeBlock, SampleBlock, SampleStatus
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import ProbeBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.message import AlarmMessage, RaisedAlarm

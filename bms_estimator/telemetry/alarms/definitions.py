@@ -12,11 +12,10 @@ from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.alarms.evaluate import evaluate
 from bms_estimator.kernels.alarms.records import EVALUATION_IO, LIMITS, LOG, NAMES, SAMPLE_ALARMS, SETTINGS
 from bms_estimator.kernels.alarms.values import BROKEN_WIRE_V
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import CellBlock, Floats, SampleBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.model.sample import CellBlock, SampleBlock
 from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarm_limits import AlarmDefinition, min_charge_current_a
 from bms_estimator.settings.alarms import AlarmName

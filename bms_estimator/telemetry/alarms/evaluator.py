@@ -13,9 +13,9 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows
 from bms_estimator.kernels.alarms.records import CELLS, FAULTY_BOARD, LINK_LOST, NAMES
+from bms_estimator.model.arrays import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock, SampleBlock, SampleStatus
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
-from bms_estimator.model.sample import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock, SampleBlock, SampleStatus
 from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarm_limits import STATE_LOST, monitored_alarms, silent_limit_s
 from bms_estimator.settings.alarms import AlarmName

@@ -8,9 +8,8 @@ from rich.table import Table
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SampleBlock
 from tests.benchmarks.capability.captures import Capture
 from tests.benchmarks.capability.discharges import LG
 from tests.benchmarks.recipes import LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_US06, Recipe, charge_ah

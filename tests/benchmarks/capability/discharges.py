@@ -14,8 +14,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import GRID
 from bms_estimator.kernels.forecast.draws import DRAW
 from bms_estimator.kernels.forecast.mean_discharge import discharge_to_cutoff
 from bms_estimator.kernels.forecast.projected_pack import FAST_RESISTANCES, growth_factor
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import Floats, SampleBlock
 from tests.benchmarks.capability.captures import Capture
 from tests.benchmarks.recipes import LFP, LFP_CELL, NCR, NCR_CELL, PF, PF_25, PF_CYCLE, PF_US06, Recipe, charge_ah
 

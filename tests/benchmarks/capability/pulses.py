@@ -13,8 +13,7 @@ from rich.table import Table
 
 from bms_estimator.forecast.available_power import DURATIONS_S, QUANTILE_STDS
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import Floats, SampleBlock
 from tests.benchmarks.capability.captures import Capture
 from tests.benchmarks.recipes import LEAF, NCR, NCR_CELL, PF, PF_25, PF_US06, Recipe
 

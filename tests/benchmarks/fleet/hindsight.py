@@ -27,9 +27,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.fleet.queries.duckdb_queries import LIMITS, Limits, run_query
 from bms_estimator.fleet.queries.parquet_files import write
 from bms_estimator.fleet.worker.hour_summary import HOUR_SUMS, Hour, add, begin, row
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.pack import PackSettings
 from tests.benchmarks.recipes import GROUPS, Group, chosen, runs
 

@@ -16,8 +16,8 @@ from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.pack_alarms import PackAlarms
 from bms_estimator.fleet.worker.pack_records import PackRecords
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.settings.pack import Settings
 from tests.benchmarks.load import CELL, pulses

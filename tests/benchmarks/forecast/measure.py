@@ -8,8 +8,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.forecast.available_power import Forecast
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import CellModel
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack.pack import Pack
 from tests.benchmarks.forecast.captures import Case
 from tests.benchmarks.forecast.scores import Outcome, Quantiles

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from tests.benchmarks.forecast.__main__ import main
 from tests.benchmarks.forecast.scores import INTERVAL_S, Outcome, Quantiles, lead, said_between, score
 from tests.benchmarks.forecast.truth import discharge_of

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks.forecast.captures import Case
 from tests.benchmarks.recipes import HIGHEST_V, LOWEST_V, charge_ah

@@ -25,8 +25,8 @@ import psutil
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.protocols.firmware.protocol import BoardProtocol
 from tests.benchmarks import disk_wear
 from tests.benchmarks.load import CELL, CURRENT_STEP_A, HALF_PERIOD_S, ON_A, VOLTAGE_STEP_V

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.numba_cache import njit
 from bms_estimator.protocols.firmware.framing import SAMPLE_FRAME_BYTES, crc16
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter

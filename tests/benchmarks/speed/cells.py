@@ -6,8 +6,8 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import NO_CELLS, SAMPLE
 from bms_estimator.settings.observer import BOARD
 from bms_estimator.sources.source import ReceivedSamples
 from tests.benchmarks.load import CELL, pulses

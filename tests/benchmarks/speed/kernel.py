@@ -13,8 +13,8 @@ import numpy as np
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.trace import TRACE
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings

@@ -15,8 +15,8 @@ from rich.table import Table
 
 from bms_estimator.calibration.ocv.chen_mora_fit import pool_tests
 from bms_estimator.calibration.thesis.series_resistance import SeriesResistance, SeriesResistanceFit
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.experiment import CLAIMS, claim, products
 from bms_estimator.reports.thesis.procedure import KNEE_SOC, Capture, Kind, Procedure

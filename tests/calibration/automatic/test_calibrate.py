@@ -10,10 +10,10 @@ from bms_estimator.calibration.elements.identify import identify
 from bms_estimator.cli.cell.calibrate import remarks
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell, with_capacity
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture, constant, steps
 from tests.calibration.simulated_relaxation import relaxation, schedule

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.guided_test.averages import means_of_windows
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 
 
 def samples_at(rate_hz, seconds):

@@ -11,8 +11,8 @@ from bms_estimator.calibration.ocv.chen_mora_fit import Points
 from bms_estimator.calibration.ocv.table_fit import fit_table
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 
 LIMITS = Limits(
     capacity_ah=3.0,

@@ -8,7 +8,7 @@ from bms_estimator.calibration.guided_test.plan import LONG, Limits
 from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 from tests.end_to_end.lfp_pack import (
     CAPACITY_FACTOR,
     CHARGER_END_A,

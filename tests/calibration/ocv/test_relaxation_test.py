@@ -10,8 +10,8 @@ from bms_estimator.calibration.ocv.chen_mora_fit import fit_chen_mora, pool_test
 from bms_estimator.calibration.ocv.relaxation_test import relaxation_test
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH
 from tests.calibration.simulated_relaxation import FIRST_REST_S, INVALID_CAPTURES, LOAD_S, REST_S, glitched, relaxation

@@ -15,8 +15,8 @@ import pytest
 
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
+from bms_estimator.model.arrays import capture_digest
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import capture_digest
 from bms_estimator.process.runtime import end
 from bms_estimator.simulation.simulated_pack import PackWithRelay
 from bms_estimator.simulation.virtual_board import VirtualBoard

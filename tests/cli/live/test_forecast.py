@@ -12,8 +12,8 @@ from bms_estimator.checkpoint.arrays_file import LOAD_SUFFIX
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.forecast.load_history import load_arrays
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from tests.command_line import run

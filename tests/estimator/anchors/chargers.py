@@ -15,8 +15,8 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import NO_LIMITS, ChargeLimits, Sampling
 
 CAPACITY_AH, SERIES = 100.0, 16

@@ -7,10 +7,9 @@ import pytest
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.anchor_settings import between_limits
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock, SampleStatus
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads.health import AnchorReport
-from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.observer import NO_LIMITS, ChargeLimits

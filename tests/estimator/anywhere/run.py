@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
 from bms_estimator.kernels.step import SampleOutcome
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import Floats, SampleBlock
 
 BLOCK_S = 600.0
 """Duration over which innovations are summed [s]. Errors of the model that last for minutes disturb the SOC."""

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from tests.estimator.anywhere.cases import CASES
 from tests.estimator.anywhere.summary import rows
 

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SampleBlock
 from tests.estimator.month.packs import Pack, draw_pack, generator
 from tests.estimator.month.simulation import Aging, simulate_use
 from tests.estimator.month.sources import (

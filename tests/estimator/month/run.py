@@ -7,8 +7,7 @@ import numpy as np
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.accuracy import Accuracy, Window
 from bms_estimator.pack_model.cell_curves import CellCurves

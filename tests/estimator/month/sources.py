@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.model.arrays import Floats
-from bms_estimator.model.sample import SAMPLE, SampleBlock, SampleStatus
+from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock, SampleStatus
 from bms_estimator.settings.observer import Sampling
 from tests.estimator.month.topics import Topics, paired
 

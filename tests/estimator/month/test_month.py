@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.sample import SampleStatus
+from bms_estimator.model.arrays import SampleStatus
 from bms_estimator.pack_model.cell_curves import CellCurves
 from tests.conftest import SHARED_DATA
 from tests.estimator.anywhere.truth import rest_state, simulate, simulate_from

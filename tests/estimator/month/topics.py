@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.settings.sources.mqtt import MqttSource
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator import Estimator
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.settings.observer import Sampling
 from tests.estimator.anywhere.use import drive
 from tests.estimator.simulated_cell import TRUTH, measured, simulate_file

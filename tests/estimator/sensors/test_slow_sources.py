@@ -8,7 +8,7 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.gap_charge import rounding_charge_variance
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE
-from bms_estimator.model.sample import SAMPLE, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import BOARD, Sampling
 from bms_estimator.settings.pack import Settings
 from tests.benchmarks.resolution import Source, scores

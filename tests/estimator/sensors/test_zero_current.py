@@ -6,8 +6,8 @@ import pytest
 from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter import ekf
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE, OFFSET, SOC, STATES
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings, Sampling
 from tests.estimator.anywhere.cases import LFP, Case, capture, load_a
 from tests.estimator.anywhere.score import score

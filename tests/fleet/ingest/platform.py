@@ -15,7 +15,7 @@ import pyarrow as pa
 from bms_estimator.fleet.ingest.ingest import ingest
 from bms_estimator.fleet.ingest.ingest_store import FILE
 from bms_estimator.fleet.ingest.startup import Options
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from tests.command_line import PROGRAM, running_program
 from tests.fleet.workers import SAMPLES, samples, until
 

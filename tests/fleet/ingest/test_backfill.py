@@ -14,8 +14,8 @@ from pyarrow import parquet
 from bms_estimator.fleet.ingest import backfill as backfill_module
 from bms_estimator.fleet.ingest.backfill import backfill, parquet_files, read_history
 from bms_estimator.fleet.ingest.batch_samples import BatchReader
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 from tests.fleet.ingest.platform import columns_of, options, running_ingest, samples_of
 from tests.fleet.ingest.worker_states import of_one_run, states, worker
 from tests.fleet.nats_cluster import NatsCluster

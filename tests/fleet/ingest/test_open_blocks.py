@@ -8,7 +8,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.fleet.ingest.batch_samples import BatchSamples
 from bms_estimator.fleet.ingest.open_blocks import NO_POSITION, OpenBlocks
-from bms_estimator.model.sample import NO_CELLS, SampleBlock
+from bms_estimator.model.arrays import NO_CELLS, SampleBlock
 from tests.fleet.ingest.platform import samples_of
 
 ROWS = samples_of("p1", 30)

@@ -9,7 +9,7 @@ from nats.aio.client import Client
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.worker import Options, work
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from tests.fleet.ingest.platform import START_S
 from tests.fleet.nats_cluster import connected
 from tests.fleet.partition_stream import estimates_of

@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.nats.block_capture import BlockCapture
-from bms_estimator.model.sample import NO_CELLS, SAMPLE
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 
 STORE_ID_NS = 1_700_000_000 * 10**9
 """Creation time of the edge's block store, which identifies it [ns since 1970]."""

@@ -14,7 +14,7 @@ from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.model.sample import NO_CELLS
+from bms_estimator.model.arrays import NO_CELLS
 from bms_estimator.sources.captures.replay import Replay, load_capture, open_capture
 from tests.command_line import run
 from tests.fleet.nats.test_block_capture import STORE_ID_NS, encoded_block, samples

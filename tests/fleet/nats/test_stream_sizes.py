@@ -27,8 +27,8 @@ from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.server.disk_space import sizes_of
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.arrays import NO_CELLS
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.settings.fleet import FleetSettings, ServerSettings, TenantSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank

@@ -30,8 +30,8 @@ from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.jwt_claims import Role
 from bms_estimator.fleet.server.nats_config import Accounts, configuration
 from bms_estimator.fleet.worker.worker import Options, work
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.fleet import TenantSettings
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, running

@@ -17,7 +17,7 @@ from bms_estimator.fleet.queries.parquet_files import write
 from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S, MAX_BEHIND_S
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.pinned_consumer import parse_position
-from bms_estimator.model.sample import SAMPLE
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.process.runtime import end
 from tests.command_line import running_program
 from tests.edge.test_edge_process import Board, write_pack_file

@@ -9,8 +9,8 @@ import pytest
 from bms_estimator import Estimator, load_cell
 from bms_estimator.edge.block import Block
 from bms_estimator.fleet.worker.hour_summary import HOUR_SUMS, Hour, add, begin, hour_of, row
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.pack_model import load_model
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings
 from tests.estimator.simulated_cell import pulses

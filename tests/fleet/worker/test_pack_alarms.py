@@ -13,7 +13,7 @@ from bms_estimator.fleet.packs.pack_type import LIVE_ALARMS
 from bms_estimator.fleet.worker.pack_state import UnpackedRecord
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.kernels.alarms.records import ALARM, NAMES
-from bms_estimator.model.sample import NO_CELLS, SampleStatus
+from bms_estimator.model.arrays import NO_CELLS, SampleStatus
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator

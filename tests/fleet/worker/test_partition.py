@@ -20,11 +20,11 @@ from bms_estimator.fleet.worker import partition as partition_module
 from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, MAX_EARLY_REPEATS, REQUEST_EVERY
 from bms_estimator.fleet.worker.block_processor import MAX_PART_SAMPLES, BlockProcessor
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.pack_model import load_model
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import ParameterReport
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.sources.captures.replay import Replay

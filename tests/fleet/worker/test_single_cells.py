@@ -15,8 +15,8 @@ from bms_estimator.fleet.worker import pack_records
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CURRENT_LAYOUT
 from bms_estimator.fleet.worker.pack_records import cell_count, cell_layout
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.model.arrays import NO_CELLS
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import NO_CELLS
 from bms_estimator.pack.pack import assemble
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.pack import PackSettings, Settings

@@ -19,8 +19,8 @@ from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, tem
 from bms_estimator.kernels.kalman_filter import noise as ekf_noise
 from bms_estimator.kernels.kalman_filter.mixture import merge_pair, mixture_moments, prune_and_merge
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, Sampling
 from tests.estimator.anywhere.cases import CASES, Case, capture
 

@@ -14,8 +14,8 @@ from bms_estimator.kernels.kalman_filter.ocv_correction import (
     reset_ocv_correction,
 )
 from bms_estimator.kernels.kalman_filter.records import NODE, NODES, STATES
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, Case, cell_file, load_a

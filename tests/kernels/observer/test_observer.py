@@ -17,8 +17,8 @@ from bms_estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.kernels.observer import observer
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
+from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
-from bms_estimator.model.sample import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import ObserverSettings
 
 THESIS_LAW = ObserverSettings(dead_zone_v=0.0, rearm_gain=None)

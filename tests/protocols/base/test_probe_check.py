@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bms_estimator.model.sample import SAMPLE, SampleStatus
+from bms_estimator.model.arrays import SAMPLE, SampleStatus
 from bms_estimator.protocols.base.probe_check import COOLING_K_PER_S, CheckedProbes, ProbeCheck
 
 NAN = math.nan

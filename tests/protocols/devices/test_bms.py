@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from bms_estimator.model.sample import NO_CELLS, SampleBlock
+from bms_estimator.model.arrays import NO_CELLS, SampleBlock
 from bms_estimator.protocols.base.polled_protocol import (
     MAX_UNANSWERED_CYCLES,
     POLL_CYCLE_S,

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, DeviceProtocol, ReadingProtocol
 from bms_estimator.protocols.devices.junctek import QUERY, JunctekProtocol
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol

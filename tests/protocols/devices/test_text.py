@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bms_estimator.model.sample import NO_CELLS, SampleBlock, SampleStatus
+from bms_estimator.model.arrays import NO_CELLS, SampleBlock, SampleStatus
 from bms_estimator.protocols.devices.text import MAX_LINE_BYTES, TextProtocol
 
 lines = (

@@ -10,7 +10,7 @@ from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.protocols.firmware.frame_decoder import FrameCounters, FrameDecoder
 from bms_estimator.protocols.firmware.messages import Hello, SampleMessage, seal
 from tests.protocols.firmware.board_messages import HELLO, NTC_STATUS, encode_hello, encode_sample

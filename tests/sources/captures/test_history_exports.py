@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.model.arrays import SampleStatus
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleStatus
 from bms_estimator.sources.captures.replay import load_capture
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 from tests.sources.captures.history_exports import (

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.model.arrays import SAMPLE, SampleStatus
 from bms_estimator.model.columns import cell_voltage_columns
-from bms_estimator.model.sample import SAMPLE, SampleStatus
 from bms_estimator.sinks.trace_file import join_columns, table_sink
 from bms_estimator.sources.captures.replay import load_capture, open_capture
 

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bms_estimator.model.arrays import SampleStatus
 from bms_estimator.model.cell_slots import CellSlots
-from bms_estimator.model.sample import SampleStatus
 from bms_estimator.protocols.devices.text import TextProtocol
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.mqtt import MqttSource

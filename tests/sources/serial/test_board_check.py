@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from serial.tools import list_ports
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.protocols.firmware.messages import hello_command
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import Reading

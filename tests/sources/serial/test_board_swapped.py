@@ -6,7 +6,7 @@ The other board scales the voltage differently and sends no hello by itself, bec
 import numpy as np
 import pytest
 
-from bms_estimator.model.sample import SampleBlock, SampleStatus
+from bms_estimator.model.arrays import SampleBlock, SampleStatus
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.framing import MAX_DOUBT_S
 from bms_estimator.protocols.firmware.protocol import BoardProtocol

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from serial.tools import list_ports
 from structlog.testing import capture_logs
 
-from bms_estimator.model.sample import SampleBlock
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.protocols.firmware.messages import MessageType
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading

@@ -17,8 +17,8 @@ import pytest
 import serial
 from serial.tools import list_ports
 
+from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleBlock
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.messages import ResetCause
 from bms_estimator.settings.sensor import SensorSettings

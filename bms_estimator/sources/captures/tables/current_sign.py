@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import CurrentSign, Floats
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import CurrentSign
 from bms_estimator.sources.captures.tables.dialects import OWN
 from bms_estimator.sources.captures.tables.layout import Layout, Role
 from bms_estimator.sources.captures.tables.voltage_response import LOAD_FRACTION, VoltageResponse

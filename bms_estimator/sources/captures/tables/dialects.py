@@ -7,7 +7,7 @@ are the same name.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from bms_estimator.model.sample import CurrentSign
+from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.sources.captures.tables.cell_values import ColumnName, fold
 
 

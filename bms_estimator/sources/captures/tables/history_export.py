@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, SampleStatus
 from bms_estimator.model.decimal_text import measured
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SampleStatus
 from bms_estimator.sources.captures.tables.cell_values import (
     MAX_TEXT_CHARACTERS,
     SI_UNITS,

@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.columns import present_columns
 from bms_estimator.model.decimal_text import number
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import SAMPLE
 from bms_estimator.sources.captures.tables.cell_values import (
     SI_UNITS,
     CellKind,

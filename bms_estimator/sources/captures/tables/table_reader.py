@@ -11,8 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.model.errors import UserError
-from bms_estimator.model.sample import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import (
     MPR_MAGIC,

@@ -5,9 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import CurrentSign, Floats, SampleBlock, SampleStatus
 from bms_estimator.model.charge_count import step_charges_as
-from bms_estimator.model.sample import CurrentSign, SampleBlock, SampleStatus
 
 HELD = int(SampleStatus.VOLTAGE_HELD | SampleStatus.CURRENT_HELD)
 """Status of samples with values of another time."""
