@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.capture_checks import FULL_SOC
 from bms_estimator.calibration.cleaning.clean_capture import remove_glitches
@@ -184,7 +183,7 @@ def _given_coefficient(curves: Sequence[ExternalCurve]) -> Floats | None:
     return np.mean(given_v, axis=0) if given_v else None
 
 
-def _checked_voltage(recording: Recording) -> NDArray[np.float64]:
+def _checked_voltage(recording: Recording) -> Floats:
     """Return the voltage without glitches [V].
 
     Raises:
@@ -196,7 +195,7 @@ def _checked_voltage(recording: Recording) -> NDArray[np.float64]:
     return voltage_v
 
 
-def _cells_in_series(voltage_v: NDArray[np.float64], configured: int | None) -> int:
+def _cells_in_series(voltage_v: Floats, configured: int | None) -> int:
     """Return the configured number of cells in series, or an estimate from the median voltage.
 
     Raises:

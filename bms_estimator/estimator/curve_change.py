@@ -6,12 +6,11 @@ The filter stores resistances as ratios to these curves. The ratios are rescaled
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.kernels.cell_model.rc_ladder import RESISTANCES, resistances
 from bms_estimator.kernels.kalman_filter.ocv_correction import reset_ocv_correction
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, Records
 
 
 def present_ohm(settings: np.void, f: np.void) -> Floats:
@@ -28,7 +27,7 @@ def present_ohm(settings: np.void, f: np.void) -> Floats:
     return ohm
 
 
-def use_curves(f: np.void, settings: NDArray[np.void], curves: np.void) -> None:
+def use_curves(f: np.void, settings: Records, curves: np.void) -> None:
     """Replace the curves in the filter's settings without a change of R_s in ohm.
 
     R_s is the series resistance learned from current steps. The filter stores it relative to R_0 of the curves.
@@ -44,7 +43,7 @@ def use_curves(f: np.void, settings: NDArray[np.void], curves: np.void) -> None:
         f["step"]["ln_ratio"] += math.log(before[0] / present_ohm(settings[0], f)[0])
 
 
-def return_to_cell_file(f: np.void, settings: NDArray[np.void], cell_file: np.void) -> None:
+def return_to_cell_file(f: np.void, settings: Records, cell_file: np.void) -> None:
     """Replace the curves of a fit by those of the cell file.
 
     SOC, capacity and the resistances at the present SOC do not change. The correction of the OCV is reset to its prior.

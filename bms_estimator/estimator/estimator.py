@@ -5,7 +5,6 @@ from copy import copy
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.estimator.anchor_settings import between_limits
 from bms_estimator.estimator.curve_change import return_to_cell_file, use_curves
@@ -20,7 +19,7 @@ from bms_estimator.kernels.observer.records import OBSERVER_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.kernels.trace import TRACE
-from bms_estimator.model.arrays import SAMPLE, SampleBlock
+from bms_estimator.model.arrays import SAMPLE, Records, SampleBlock
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.observer import (
@@ -34,7 +33,7 @@ from bms_estimator.settings.observer import (
 )
 from bms_estimator.settings.pack import Settings
 
-TraceBlock = NDArray[np.void]
+TraceBlock = Records
 """Shape (n,), dtype ``TRACE``: one row for each accepted sample."""
 SAMPLE_OUTCOMES = tuple(SampleOutcome)
 """Outcomes by their integer values. Indexing a tuple is faster than ``SampleOutcome(value)``, which takes nearly as long as
@@ -94,13 +93,13 @@ class Estimator:
             sampling=sampling,
             limits=limits,
         )
-        self.settings: NDArray[np.void] = self.settings_record["observer"]
+        self.settings: Records = self.settings_record["observer"]
         self.cell_file_settings: np.void = self.settings_record[0]["filter"].copy()
-        self.record: NDArray[np.void] = np.zeros(1, dtype=ESTIMATOR_STATE)
-        self.state: NDArray[np.void] = self.record["observer"]
+        self.record: Records = np.zeros(1, dtype=ESTIMATOR_STATE)
+        self.state: Records = self.record["observer"]
         self._trace: TraceBlock = np.zeros(0, dtype=TRACE)
 
-    def bound_to_record(self, record: NDArray[np.void]) -> Self:
+    def bound_to_record(self, record: Records) -> Self:
         """Return an estimator that shares the settings and works on ``record``, shape (1,), dtype ``ESTIMATOR_STATE``."""
         other = copy(self)
         other.record, other.state = record, record["observer"]
@@ -223,7 +222,7 @@ class Estimator:
         checks["suspects"] = checks["suspects"] & ~FITTED_FAULTS | state.faults
         store_last_good_state(checks, f)
 
-    def load_exact(self, record: NDArray[np.void], settings_record: NDArray[np.void]) -> None:
+    def load_exact(self, record: Records, settings_record: Records) -> None:
         """Restore copies of ``record`` and ``settings_record``, bit by bit."""
         self.record[...], self.settings_record[...] = record, settings_record
 
@@ -232,10 +231,10 @@ class Estimator:
         h = self.record[0]["history"]
         h["enabled"], h["event_s"] = 1, event_s
 
-    def take_rows(self) -> NDArray[np.void]:
+    def take_rows(self) -> Records:
         """Remove the completed history rows from the record, and return them."""
         h = self.record[0]["history"]
-        rows: NDArray[np.void] = h["rows"][: int(h["count"])].copy()
+        rows: Records = h["rows"][: int(h["count"])].copy()
         if rows.size:
             h["count"] = 0
             h["rows"] = np.zeros(1, HISTORY_ROW)  # stale rows would depend on the division of the samples into blocks
@@ -245,11 +244,11 @@ class Estimator:
         """Discard all history rows, also the present one."""
         self.record["history"]["count"] = self.record["history"]["sums"]["duration_s"] = 0
 
-    def complete_rows(self) -> NDArray[np.void]:
+    def complete_rows(self) -> Records:
         """Complete the present history row, and return a copy of all rows of the record."""
         h = self.record[0]["history"]
         complete_row(h)
-        rows: NDArray[np.void] = h["rows"][: int(h["count"])].copy()
+        rows: Records = h["rows"][: int(h["count"])].copy()
         return rows
 
     def begin_segment(self, elapsed_s: float, segment: float, gap_s: float) -> None:

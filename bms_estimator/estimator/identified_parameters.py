@@ -5,7 +5,6 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import SOC_GRID
@@ -16,7 +15,7 @@ from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import C_TL, C_TS, R_S, R_TL, R_TS, ln_r_s_ratio
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION, node_error_scale, node_position
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
-from bms_estimator.model.arrays import exp
+from bms_estimator.model.arrays import Floats, exp
 from bms_estimator.model.cell import CellModel, TableOcv
 
 MAX_CAPACITY_STD = 0.3
@@ -101,14 +100,14 @@ def _series_ohm(f: np.void, p: np.void) -> float:
     return float(f["weak"] * weak_ohm + f["strong"] * strong_ohm)
 
 
-def fitted_ocv_correction(estimator: Estimator, soc: NDArray[np.float64]) -> NDArray[np.float64]:
+def fitted_ocv_correction(estimator: Estimator, soc: Floats) -> Floats:
     """Return the correction of the cell file's OCV by the slow fit [V]. The filter's own correction is not included."""
     p, cell_file = estimator.settings_record[0]["filter"], estimator.cell_file_settings
-    difference_v: NDArray[np.float64] = p["ocv_v"] - cell_file["ocv_v"]
+    difference_v: Floats = p["ocv_v"] - cell_file["ocv_v"]
     return np.asarray(np.interp(soc, np.linspace(0.0, 1.0, difference_v.size), difference_v))
 
 
-def fitted_resistance_factors(estimator: Estimator, soc: NDArray[np.float64]) -> NDArray[np.float64]:
+def fitted_resistance_factors(estimator: Estimator, soc: Floats) -> Floats:
     """Return the slow fit's factors on the resistances R_0..R_6 of the cell file, shape (n, RESISTANCES)."""
     p, cell_file = estimator.settings_record[0]["filter"], estimator.cell_file_settings
     fitted_ohm, file_ohm = (record["weak_ohm"] + record["strong_ohm"] for record in (p, cell_file))
@@ -134,9 +133,7 @@ def _state_and_std(record: np.void, j: int) -> tuple[float, float]:
     return mean, math.sqrt(weight @ (variances + (values - mean) ** 2))
 
 
-def ocv_correction_with_std(
-    record: np.void, settings: np.void, soc: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ocv_correction_with_std(record: np.void, settings: np.void, soc: Floats) -> tuple[Floats, Floats]:
     """Return the OCV correction learned by the most likely hypothesis, and its standard deviation.
 
     Args:
@@ -155,7 +152,7 @@ def ocv_correction_with_std(
 
 
 @lru_cache(maxsize=64)
-def _node_weights(settings: bytes, socs: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _node_weights(settings: bytes, socs: bytes) -> tuple[Floats, Floats]:
     """Return the weight of each node of the correction, and the std of the varying error of the curve, at each SOC [V].
 
     Args:

@@ -6,7 +6,6 @@ Numbers in parentheses are equations of the thesis.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.estimator.anchor_settings import anchor_settings
 from bms_estimator.estimator.filter_settings import (
@@ -27,7 +26,7 @@ from bms_estimator.kernels.observer.mittag_leffler import decay_table, series_co
 from bms_estimator.kernels.observer.nussbaum import Nussbaum
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
-from bms_estimator.model.arrays import exp
+from bms_estimator.model.arrays import Floats, Records, exp
 from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
 from bms_estimator.model.monotone_cubic import MonotoneCubic
 from bms_estimator.model.pack_model import FuelCellModel, PackModel
@@ -59,7 +58,7 @@ MAX_FACTORS = {
 activation loss at 1 A corresponds to a factor of about 8 on the exchange current."""
 
 
-def fuel_cell_settings(cell: FuelCellModel, observer_record: np.void) -> NDArray[np.void]:
+def fuel_cell_settings(cell: FuelCellModel, observer_record: np.void) -> Records:
     """Return the learning law's settings record.
 
     The output error is not injected as a voltage offset, because a constant voltage error indicates the exchange current.
@@ -105,7 +104,7 @@ IMPROVED_INDICES = range(1, 13)
 """Indices of the a_i that the improved method adapts (Algorithm 1 of the thesis). a13..a15 follow from (4.2)."""
 
 
-def ocv_grid(cell: CellModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ocv_grid(cell: CellModel) -> tuple[Floats, Floats]:
     """Return the open-circuit voltage and its slope dOCV/dSOC [V] at ``OCV_POINTS`` evenly spaced SOCs 0..1."""
     soc = np.linspace(0.0, 1.0, OCV_POINTS)
     if isinstance(cell.ocv, ChenMoraOcv):
@@ -126,7 +125,7 @@ def estimator_settings(
     initial_soc: float | None,
     sampling: Sampling = EXACT,
     limits: ChargeLimits = NO_LIMITS,
-) -> NDArray[np.void]:
+) -> Records:
     """Return the settings record of the whole estimator.
 
     Args:
@@ -169,7 +168,7 @@ def estimator_settings(
 
 def observer_settings(
     cell: CellModel, observer: ObserverSettings, voltage_resolution_v: float, initial_soc: float | None
-) -> NDArray[np.void]:
+) -> Records:
     """Return the observer's settings record.
 
     Args:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.kernels.forecast.power import available_power, new_scratch
 from bms_estimator.kernels.kalman_filter.records import SOC
@@ -35,7 +34,7 @@ FORECAST = np.dtype(
 )
 """Values of a forecast; NaN if unknown. The published fields have the same names."""
 
-ForecastRows = NDArray[np.void]
+ForecastRows = Records
 """Shape (n,), dtype ``FORECAST``."""
 
 

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 """Array of floats."""
+Masks = NDArray[np.bool_]
+"""Array of conditions."""
 Record = Any
 """Element of a structured array in a kernel. Its type is Any, because only numba resolves its fields."""
 Records = NDArray[np.void]

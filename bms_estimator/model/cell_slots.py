@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import CellBlock, Floats
+from bms_estimator.model.arrays import CellBlock, Floats, Masks
 
 MIN_LIVE_V, MAX_LIVE_V = 0.1, 6.0
 """Range of the absolute voltage of a live cell [V]. Empty slots read 0 V, a few millivolts of noise, or the largest number of
@@ -94,7 +93,7 @@ class CellSlots:
             selected_v[first:end] = self._cells(slots_v[first:end], live[first])
         return selected_v
 
-    def _cells(self, slots_v: CellBlock, live: NDArray[np.bool_]) -> CellBlock:
+    def _cells(self, slots_v: CellBlock, live: Masks) -> CellBlock:
         """Return the voltages of the cells of samples with the same live slots [V]."""
         count = int(live.sum())
         if count > self._series:
@@ -118,7 +117,7 @@ class CellSlots:
         return slots_v[:, np.sort(order)]
 
 
-def is_live(slots_v: Floats) -> NDArray[np.bool_]:
+def is_live(slots_v: Floats) -> Masks:
     """Return True for each slot that has the voltage of a cell; NaN: False."""
     magnitude_v = np.abs(slots_v)
     return (magnitude_v >= MIN_LIVE_V) & (magnitude_v <= MAX_LIVE_V)

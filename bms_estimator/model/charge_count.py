@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, Masks
 from bms_estimator.model.unmeasured_time import MAX_FLOW_S, UNMEASURED_S
 
 MIN_GAP_PERIODS = 10.0
@@ -29,7 +28,7 @@ class TimeFaults:
         self._first_back_s = (0.0, 0.0)  # times before and after the step
         self._longest_gap_s = (0.0, 0.0)  # time of its start, and duration
 
-    def add(self, time_s: NDArray[np.float64]) -> None:
+    def add(self, time_s: Floats) -> None:
         """Add the times of a block."""
         finite_s = np.concatenate([[self._last_s], time_s])
         finite_s = finite_s[np.isfinite(finite_s)]
@@ -63,7 +62,7 @@ class TimeFaults:
         return lines
 
 
-def gap_s(step_s: NDArray[np.float64]) -> float:
+def gap_s(step_s: Floats) -> float:
     """Return the duration from which a step between two samples is a gap [s]; infinite without steps forward."""
     forward_s = step_s[step_s > 0.0]
     if not forward_s.size:
@@ -110,7 +109,7 @@ def smaller_current_a(current_a: Floats) -> Floats:
     return np.asarray(np.where(before_a * after_a > 0.0, np.copysign(smaller_a, before_a), 0.0))
 
 
-def are_long_gaps(time_s: Floats) -> NDArray[np.bool_]:
+def are_long_gaps(time_s: Floats) -> Masks:
     """Return which steps between two samples are gaps longer than ``MAX_FLOW_S``. Shape (n - 1,)."""
     step_s = np.diff(time_s)
     return np.asarray(step_s > max(gap_s(step_s), MAX_FLOW_S))

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS, accumulate_charge_energy
 from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, accumulate_window
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
-from bms_estimator.model.arrays import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock
+from bms_estimator.model.arrays import NO_CELLS, NO_PROBES, CellBlock, Floats, ProbeBlock, Records
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Totals
@@ -65,9 +64,9 @@ class ChargeEnergyMeter:
         sums: External storage of the sums, shape (1,), dtype ``FLOW_SUMS``; None: internal.
     """
 
-    def __init__(self, before: ChargeEnergy, gap_s: float, sums: NDArray[np.void] | None = None) -> None:
+    def __init__(self, before: ChargeEnergy, gap_s: float, sums: Records | None = None) -> None:
         self._gap_s = gap_s
-        self._sums: NDArray[np.void] = np.zeros(1, dtype=FLOW_SUMS) if sums is None else sums
+        self._sums: Records = np.zeros(1, dtype=FLOW_SUMS) if sums is None else sums
         self.continue_from(before)
 
     def continue_from(self, totals: ChargeEnergy) -> None:
@@ -146,9 +145,7 @@ class LifetimeTotals:
         return float(state["time_s"]), float(state["step_s"]), int(state["gaps"])
 
 
-def gap_lengths(
-    times_s: NDArray[np.float64], before_s: float, step_s: float, gap_s: float, restart_s: float
-) -> list[float]:
+def gap_lengths(times_s: Floats, before_s: float, step_s: float, gap_s: float, restart_s: float) -> list[float]:
     """Return the lengths of the gaps among some samples [s]; gaps are defined by ``kernels.step.is_gap``.
 
     Args:
@@ -253,7 +250,7 @@ class WindowSummary:
     sample_rate_hz: float
     last: np.void
     soc_known: bool
-    cells_v: NDArray[np.float64]
+    cells_v: Floats
     probes: ProbeBlock
 
 
@@ -267,7 +264,7 @@ class Window:
 
     def __init__(self) -> None:
         self.previous_end_s, self.soc_known = math.nan, False
-        self._sums: NDArray[np.void] = np.zeros(1, dtype=WINDOW_SUMS)
+        self._sums: Records = np.zeros(1, dtype=WINDOW_SUMS)
         self._clear()
 
     def _clear(self) -> None:

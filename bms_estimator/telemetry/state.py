@@ -6,7 +6,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.forecast.available_power import FORECAST, Forecast, unknown_values
 from bms_estimator.kernels.trace import TRACE
@@ -231,7 +230,7 @@ def make_state_payload(
     )
 
 
-def _cells(cells_v: NDArray[np.float64]) -> dict[str, Any]:
+def _cells(cells_v: Floats) -> dict[str, Any]:
     """Return the fields of single cells. ``cells_v`` has shape (m,) [V], NaN for an unknown voltage."""
     if not (cells_v.size and np.isfinite(cells_v).any()):
         return dict.fromkeys(("cell_lowest_v", "cell_highest_v", "cell_lowest", "cell_highest", "cells_v"))

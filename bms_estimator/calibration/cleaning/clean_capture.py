@@ -8,9 +8,8 @@ show a resistance of zero.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import Floats, SampleBlock
+from bms_estimator.model.arrays import Floats, Masks, SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.errors import UserError
@@ -33,7 +32,7 @@ MIN_SAMPLES = 4
 """Number of samples at a step: one before it, the mismatched one, and two after it."""
 
 
-def are_mismatched(samples: SampleBlock) -> NDArray[np.bool_]:
+def are_mismatched(samples: SampleBlock) -> Masks:
     """Return which samples have the voltage of the other side of a step of the current. Shape (n,).
 
     Args:
@@ -59,13 +58,13 @@ def with_matched_voltages(samples: SampleBlock) -> SampleBlock:
     return matched
 
 
-def _early_voltages(samples: SampleBlock) -> NDArray[np.bool_]:
+def _early_voltages(samples: SampleBlock) -> Masks:
     """Return which samples have the current before a step and the voltage after it."""
     # backward in time, an early voltage is an old one
     return np.asarray(_old_voltages(samples[::-1])[::-1], dtype=np.bool_)
 
 
-def _old_voltages(samples: SampleBlock) -> NDArray[np.bool_]:
+def _old_voltages(samples: SampleBlock) -> Masks:
     """Return which samples have the current after a step and the voltage before it."""
     if samples.size < MIN_SAMPLES:
         return np.zeros(samples.size, dtype=np.bool_)
@@ -144,7 +143,7 @@ def remove_glitches(samples: SampleBlock, name: str) -> SampleBlock:
     return select_samples(good, is_later)
 
 
-def select_samples(samples: SampleBlock, mask: NDArray[np.bool_]) -> SampleBlock:
+def select_samples(samples: SampleBlock, mask: Masks) -> SampleBlock:
     """Return the samples for which ``mask`` is True: ``samples`` itself if all are, because a long capture is large."""
     return samples if mask.all() else samples[mask]
 
@@ -157,9 +156,9 @@ def soc_by_counting(samples: SampleBlock, capacity_ah: float, initial_soc: float
     return initial_soc - charge_ah(samples["time_s"], samples["current_a"]) / capacity_ah
 
 
-def resting_samples(good: SampleBlock, capacity_ah: float) -> NDArray[np.bool_]:
+def resting_samples(good: SampleBlock, capacity_ah: float) -> Masks:
     """Return which samples belong to a rest. Short glitches of the current sensor do not end a rest."""
-    resting: NDArray[np.bool_] = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
+    resting: Masks = np.abs(good["current_a"]) < rest_current_a(good["current_a"], capacity_ah)
     time_s = good["time_s"]
     for first, last in true_runs(~resting):
         until_s = time_s[min(last, good.size - 1)]
@@ -179,7 +178,7 @@ def rest_current_a(current_a: Floats, capacity_ah: float) -> float:
     return max(REST_C_RATE * capacity_ah, min(NOISE_STDS * noise_a, half_load_a))
 
 
-def true_runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def true_runs(mask: Masks) -> list[tuple[int, int]]:
     """Return the runs of True in ``mask``, each as (first index, index after the last)."""
     edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -236,7 +235,7 @@ class CleanCapture:
     voltage_v: Floats
     temperature_c: Floats
     discharged_ah: Floats
-    mismatched: NDArray[np.bool_]
+    mismatched: Masks
     resting_samples: int
     samples: int
     glitches: int

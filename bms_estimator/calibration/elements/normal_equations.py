@@ -20,7 +20,6 @@ a cold drive is twice too large.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, true_runs
@@ -32,7 +31,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     REFERENCE_C,
     RESISTANCES,
 )
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, Masks
 from bms_estimator.model.errors import UserError
 
 SOC_NODES = np.array([0.0, 0.1, 0.2, 0.3, 0.45, 0.65, 0.85, 1.0])
@@ -207,13 +206,13 @@ def normal_equations(
     )
 
 
-def _first_of_each_slot(time_s: Floats) -> NDArray[np.bool_]:
+def _first_of_each_slot(time_s: Floats) -> Masks:
     """Return a mask of the first sample in each slot of ``ROW_INTERVAL_S``."""
     slot = np.floor(time_s / ROW_INTERVAL_S)
     return np.asarray(np.r_[True, np.diff(slot) > 0.0], dtype=np.bool_)
 
 
-def _weights(capture: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
+def _weights(capture: CleanCapture) -> tuple[Floats, Masks]:
     """Return the relative weight of each row, and a mask of the last rows of long rests."""
     largest_a = float(np.abs(capture.current_a).max())
     step_s = np.clip(np.diff(capture.time_s, append=capture.time_s[-1] + 1.0), 0.0, MAX_ROW_S)
@@ -231,7 +230,7 @@ def _weights(capture: CleanCapture) -> tuple[Floats, NDArray[np.bool_]]:
     return weight, last
 
 
-def _clean_steps(capture: CleanCapture) -> NDArray[np.bool_]:
+def _clean_steps(capture: CleanCapture) -> Masks:
     """Return a mask of the samples directly after clean current steps (see ``STEADY_FRACTION``)."""
     largest_a = float(np.abs(capture.current_a).max())
     change_a = np.abs(np.diff(capture.current_a, prepend=capture.current_a[0]))

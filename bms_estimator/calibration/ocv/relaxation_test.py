@@ -8,7 +8,6 @@ and the standard deviation of the point contains the error of the extrapolation.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.clean_capture import (
     SOC_SLACK,
@@ -19,7 +18,7 @@ from bms_estimator.calibration.cleaning.clean_capture import (
     true_runs,
     with_matched_voltages,
 )
-from bms_estimator.model.arrays import Floats, SampleBlock
+from bms_estimator.model.arrays import Floats, Masks, SampleBlock
 from bms_estimator.model.errors import UserError
 
 MIN_REST_S = 30.0
@@ -176,9 +175,7 @@ def relaxation_test(
     )
 
 
-def find_rests(
-    good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], series_count: int
-) -> tuple[list[Rest], list[str]]:
+def find_rests(good: SampleBlock, soc: Floats, resting: Masks, series_count: int) -> tuple[list[Rest], list[str]]:
     """Return the usable rests of a capture, and a reason for each rejected rest.
 
     Args:
@@ -209,7 +206,7 @@ def find_rests(
     return rests, rejected
 
 
-def _empty_v(good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], rests: list[Rest]) -> float:
+def _empty_v(good: SampleBlock, soc: Floats, resting: Masks, rests: list[Rest]) -> float:
     """Return the open-circuit voltage at the end of a capture that ends empty and under load [V], otherwise NaN."""
     if resting[-1] or abs(soc[-1]) > NEAR_EMPTY or not rests:
         return float("nan")
@@ -218,7 +215,7 @@ def _empty_v(good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], rests: 
     return min(float(good["voltage_v"][-1]) + overpotential_v, rests[-1].ocv_v)
 
 
-def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: NDArray[np.bool_], capacity_ah: float) -> None:
+def _check_charge(name: str, good: SampleBlock, soc: Floats, resting: Masks, capacity_ah: float) -> None:
     """Check the sign of the current and the capacity.
 
     Raises:
@@ -305,9 +302,7 @@ def _fit_with_tau(elapsed: Floats, voltage_v: Floats, tau_s: float) -> tuple[Flo
     return coefficients, basis, float(residual @ residual)
 
 
-def _check_rests(
-    name: str, good: SampleBlock, rests: list[Rest], rejected: list[str], resting: NDArray[np.bool_]
-) -> None:
+def _check_rests(name: str, good: SampleBlock, rests: list[Rest], rejected: list[str], resting: Masks) -> None:
     """Check that a capture has enough usable rests.
 
     Raises:

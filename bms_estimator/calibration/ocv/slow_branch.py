@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from bms_estimator.calibration.cleaning.capture_checks import StartOrigin, StartSoc
@@ -14,7 +13,7 @@ from bms_estimator.calibration.cleaning.clean_capture import (
     true_runs,
     with_matched_voltages,
 )
-from bms_estimator.model.arrays import Floats, SampleBlock
+from bms_estimator.model.arrays import Floats, Masks, SampleBlock
 from bms_estimator.model.charge_count import are_long_gaps, charge_ah
 from bms_estimator.model.errors import UserError
 
@@ -105,7 +104,7 @@ def slow_branches(good: SampleBlock, name: str, start: StartSoc) -> list[SlowBra
 
 
 def _branch(
-    good: SampleBlock, moved_ah: Floats, resting: NDArray[np.bool_], first: int, last: int, name: str, start: StartSoc
+    good: SampleBlock, moved_ah: Floats, resting: Masks, first: int, last: int, name: str, start: StartSoc
 ) -> SlowBranch:
     """Return the low-rate discharge or charge in the samples ``first`` to ``last`` - 1.
 

@@ -8,12 +8,11 @@ at one SOC. In both, E_o depends on SOC.
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.calibration.cleaning.clean_capture import remove_glitches, soc_by_counting
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, delta, ocv_of_each, r_s, r_tl, r_ts, simulate_cell
-from bms_estimator.model.arrays import Floats, SampleBlock
+from bms_estimator.model.arrays import Floats, Masks, SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 
@@ -65,7 +64,7 @@ class Prediction:
         return float(self.error_percent.mean())
 
     @property
-    def aligned(self) -> NDArray[np.bool_]:
+    def aligned(self) -> Masks:
         """Mask without the first samples after current jumps. Their voltage is often from before the jump."""
         jump_a = np.abs(np.diff(self.current_a, prepend=self.current_a[0]))
         return np.asarray(jump_a <= JUMP_FRACTION * np.abs(self.current_a).max())

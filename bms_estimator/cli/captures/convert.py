@@ -10,7 +10,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
@@ -124,9 +123,7 @@ def _blocks(capture: Capture, progress: Progress, faults: TimeFaults) -> Iterato
         progress(capture.fraction)
 
 
-def _project_blocks(
-    reopen: Callable[[], Capture], progress: Progress, faults: TimeFaults
-) -> Iterator[NDArray[np.void]]:
+def _project_blocks(reopen: Callable[[], Capture], progress: Progress, faults: TimeFaults) -> Iterator[Records]:
     """Yield the samples of a capture in this project's columns. A first pass finds the columns without values, which are omitted.
 
     Args:
@@ -160,7 +157,7 @@ def _columns_with_values(capture: Capture) -> tuple[list[str], int]:
     return columns + [lowest, highest] * has_probes + [status] * has_status, cells
 
 
-def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress, faults: TimeFaults) -> Iterator[NDArray[np.void]]:
+def _bdf_blocks(reopen: Callable[[], Capture], progress: Progress, faults: TimeFaults) -> Iterator[Records]:
     """Yield the samples of a capture in the Battery Data Format.
 
     The first pass reads up to the first temperature, to decide whether the file has a column for it.

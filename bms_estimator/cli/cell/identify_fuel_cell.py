@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.console import Console, Group
 from rich.table import Table
@@ -17,7 +16,7 @@ from rich.table import Table
 from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.cli.options.capture_options import load_captures, name_of, unique_names
 from bms_estimator.kernels.kalman_filter.temperature import MAX_PLAUSIBLE_C, MIN_PLAUSIBLE_C
-from bms_estimator.model.arrays import CurrentSign, Floats
+from bms_estimator.model.arrays import CurrentSign, Floats, Masks
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import FuelCellModel, load_fuel_cell, write_cell
 from bms_estimator.sources.captures.curves import read_polarisation
@@ -119,7 +118,7 @@ def _read_source(
     )
 
 
-def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floats) -> NDArray[np.bool_]:
+def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floats) -> Masks:
     """Return a mask of the points within the stack's limits, shape (n,).
 
     Raises:
@@ -129,7 +128,7 @@ def _usable(path: Path, model: FuelCellModel, current_a: Floats, voltage_v: Floa
     is_charging = current_a < -model.fuel_cell.internal_current_a
     if 2 * is_charging.sum() > is_charging.size:
         raise UserError(f"{path}: the current is negative, but a fuel cell cannot be charged: is --current-sign right?")
-    usable: NDArray[np.bool_] = (voltage_v >= cell.voltage_min_v) & (voltage_v <= cell.voltage_max_v)
+    usable: Masks = (voltage_v >= cell.voltage_min_v) & (voltage_v <= cell.voltage_max_v)
     usable &= (current_a <= cell.current_max_a) & ~is_charging
     if usable.sum() < MIN_POINTS:
         limits = f"{cell.voltage_min_v:g} to {cell.voltage_max_v:g} V and up to {cell.current_max_a:g} A"

@@ -4,10 +4,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.model.arrays import Floats
+from bms_estimator.model.arrays import Floats, Records
 from bms_estimator.model.cell import CellModel
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.bank_comparison import MIN_ROWS, SINCE_EARLIER, Comparison, Reference, ReferenceCurve
@@ -92,12 +91,12 @@ class BankExperiment:
         return sorted(found)
 
     @cached_property
-    def _healthy_rows(self) -> list[NDArray[np.void]]:
+    def _healthy_rows(self) -> list[Records]:
         equal = BankCells.equal(SERIES, self._cell.cell.capacity_ah)
         return [self._discharge(equal, seed) for seed in range(HEALTHY_DISCHARGES)]
 
     @cached_property
-    def _faulty_rows(self) -> NDArray[np.void]:
+    def _faulty_rows(self) -> Records:
         cells = BankCells.equal(SERIES, self._cell.cell.capacity_ah)
         soc = np.array([1.0, *WEAK_SOC])
         return self._discharge(replace(cells, soc=soc), seed=HEALTHY_DISCHARGES)
@@ -111,7 +110,7 @@ class BankExperiment:
             raise RuntimeError("two complete discharges have too few rows for a reference")
         return Reference(self._fit, curve, SINCE_EARLIER)
 
-    def _discharge(self, cells: BankCells, seed: int) -> NDArray[np.void]:
+    def _discharge(self, cells: BankCells, seed: int) -> Records:
         """Return the history rows of a complete discharge."""
         one_c = self._cell.cell.capacity_ah
         bank = SimulatedBank(self._cell, cells)
@@ -122,11 +121,11 @@ class BankExperiment:
         rows = recorder.history.rows
         return rows[is_discharge(rows)]
 
-    def _soc(self, rows: NDArray[np.void]) -> Floats:
+    def _soc(self, rows: Records) -> Floats:
         """Return the SOC of a healthy bank that began full."""
         return np.asarray(1.0 - rows["charge_as"] / self._curves.capacity_as)
 
-    def _e_o(self, rows: NDArray[np.void]) -> BankDischarge:
+    def _e_o(self, rows: Records) -> BankDischarge:
         soc = self._soc(rows)
         measured = OpenCircuit.of(self._curves, self._fit, rows, soc)
         e_o_v = SERIES * (measured.error_v + fitted_ocv(self._curves, self._fit, soc))

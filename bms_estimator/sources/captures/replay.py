@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Protocol, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.model.arrays import (
     NO_PROBES,
@@ -254,7 +253,7 @@ class Replay:
             last_s, elapsed_s = float(block["time_s"][-1]), float(due_s[-1])
 
 
-def _parts(time_s: NDArray[np.float64], max_block_s: float) -> Iterator[slice]:
+def _parts(time_s: Floats, max_block_s: float) -> Iterator[slice]:
     """Yield slices that divide a block into parts of limited duration."""
     if math.isinf(max_block_s):
         yield slice(0, time_s.size)
@@ -265,7 +264,7 @@ def _parts(time_s: NDArray[np.float64], max_block_s: float) -> Iterator[slice]:
         yield slice(first, end)
 
 
-def _elapsed(time_s: NDArray[np.float64], last_s: float) -> NDArray[np.float64]:
+def _elapsed(time_s: Floats, last_s: float) -> Floats:
     """Return the time elapsed since ``last_s`` [s]; backward steps and timestamps that are not finite count as 0."""
     steps = np.diff(time_s, prepend=last_s)
     return np.cumsum(np.where(np.isfinite(steps), steps, 0.0).clip(min=0.0))

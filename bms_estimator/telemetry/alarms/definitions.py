@@ -6,13 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.alarms.evaluate import evaluate
 from bms_estimator.kernels.alarms.records import EVALUATION_IO, LIMITS, LOG, NAMES, SAMPLE_ALARMS, SETTINGS
 from bms_estimator.kernels.alarms.values import BROKEN_WIRE_V
-from bms_estimator.model.arrays import CellBlock, Floats, SampleBlock
+from bms_estimator.model.arrays import CellBlock, Floats, Records, SampleBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.pack_model import PackModel
@@ -41,9 +40,9 @@ class AlarmDefinitions(NamedTuple):
 
     by_position: dict[int, AlarmDefinition]
     """Definition of each monitored alarm by its position in ``NAMES``."""
-    limits: NDArray[np.void]
+    limits: Records
     """Shape (number of ``NAMES``,), dtype ``LIMITS``."""
-    settings: NDArray[np.void]
+    settings: Records
     """Shape (1,), dtype ``SETTINGS``."""
     bounds: PackBounds
 
@@ -103,9 +102,9 @@ class EvaluationKernel:
 
     def run(
         self,
-        alarms: NDArray[np.void],
+        alarms: Records,
         definitions: AlarmDefinitions,
-        estimator: NDArray[np.void],
+        estimator: Records,
         samples: SampleBlock,
         cells_v: CellBlock,
         trace: TraceBlock,
@@ -137,7 +136,7 @@ class EvaluationKernel:
         )
 
     @property
-    def entries(self) -> NDArray[np.void]:
+    def entries(self) -> Records:
         """Changes since the last call of ``clear``, oldest first, dtype ``LOG``."""
         return self.log[: int(self.io["logged"][0])]
 

@@ -7,9 +7,17 @@ from enum import Enum
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import MAX_C, MIN_C, NO_CELLS, SAMPLE, CellBlock, SampleBlock, remove_implausible
+from bms_estimator.model.arrays import (
+    MAX_C,
+    MIN_C,
+    NO_CELLS,
+    SAMPLE,
+    CellBlock,
+    Floats,
+    SampleBlock,
+    remove_implausible,
+)
 from bms_estimator.sources.captures.tables.cell_values import (
     SI_UNITS,
     CellKind,
@@ -66,7 +74,7 @@ class CellVoltage(NamedTuple):
 ColumnRole = Role | CellVoltage
 TIME_ROLES = (Role.TIME, Role.CLOCK)
 """Roles of columns with a time."""
-RawBlock = dict[ColumnRole, NDArray[np.float64]]
+RawBlock = dict[ColumnRole, Floats]
 """Columns of a block of rows, in the units of the table."""
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleBlock
+from bms_estimator.model.arrays import NO_CELLS, SAMPLE, Floats, SampleBlock
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.tables.cell_values import DATES, CellKind
 from bms_estimator.sources.captures.tables.column_tables import (
@@ -284,7 +283,7 @@ def _separate_steps(before: SampleBlock, samples: SampleBlock) -> SampleBlock:
     return first_of_last_time
 
 
-def _first_finite(values: NDArray[np.float64]) -> float:
+def _first_finite(values: Floats) -> float:
     finite = values[np.isfinite(values)]
     return float(finite[0]) if finite.size else 0.0
 

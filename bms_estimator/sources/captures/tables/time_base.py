@@ -3,8 +3,8 @@
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bms_estimator.model.arrays import Floats
 from bms_estimator.sources.captures.tables.cell_values import DATES, TIME_UNITS, CellKind, Unit, find_unit
 from bms_estimator.sources.captures.tables.dialects import OWN
 from bms_estimator.sources.captures.tables.layout import Column, Layout, RawBlock, Role, without_clock
@@ -33,8 +33,6 @@ MAX_EXCEL_PERIOD_S = 3600.0
 """Maximum sample period of dates as numbers of days [s]."""
 MIN_PERIOD_S, MAX_PERIOD_S = 0.005, 90.0
 """Range of the sample period [s]. With a period beyond it, the assumed unit is probably wrong."""
-
-Floats = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
