@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bms_estimator.estimator import Estimator
-from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, delta, min_stable_exponent
+from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, delta
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.errors import UserError
@@ -234,13 +234,6 @@ class AdaptiveRun:
     epsilon_v: float
     lock_losses: int
     outcome: str
-
-    def condition(self, parameter: str) -> Floats:
-        """Return the bound of a8 or a11 over time: the right side of the condition in Lemma 4.1.1, Fig. 19."""
-        amplitude, offset = {"a8": (7, 9), "a11": (10, 12)}[parameter]  # indices in ``a``
-        # the lower limit of SOC avoids a division by zero
-        rows = zip(np.maximum(self.soc, 1e-6), self.a[:, offset], self.a[:, amplitude], strict=True)
-        return np.array([min_stable_exponent(soc, a_offset, a_amplitude) for soc, a_offset, a_amplitude in rows])
 
 
 def adaptive_run(

@@ -4,7 +4,8 @@ Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from bms_estimator.reports.report_parts import plot
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.reports.thesis.experiment import Experiment
 from bms_estimator.reports.thesis.observer_plots import crossing_plot, dynamic_static_plot, elements_plot, products_plot
-from bms_estimator.reports.thesis.procedure import Kind, Procedure
+from bms_estimator.reports.thesis.procedure import Capture, Kind, Procedure
 from bms_estimator.reports.thesis.report_items import Figure, Reproduction
 from bms_estimator.reports.thesis.simulation import SOC_GRID
 
@@ -67,42 +68,29 @@ def figure_27(experiment: Experiment) -> Figure:
     return _figure("27", "Currents of the voltage relaxation tests", _currents(tests, "27"), experiment, "")
 
 
-def _currents(captures: list[Any], key: str) -> str:
+def _currents(captures: Sequence[Capture], key: str) -> str:
     """Return a figure of the currents of captures, one plot for each; empty without captures."""
-    if not captures:
-        return ""
-    columns = 2 if len(captures) > 1 else 1
-    rows = math.ceil(len(captures) / columns)
+    samples = {capture.name: capture.samples for capture in captures}
 
-    def draw(axes: Any) -> None:
-        for ax, capture in zip(np.atleast_1d(axes).flat, captures, strict=False):
-            hours, current = thin(capture.samples["time_s"] / 3600.0, capture.samples["current_a"], points=3000)
-            ax.plot(hours, current, linewidth=0.8)
-            ax.set(xlabel="time [h]", ylabel="A", title=capture.name)
-        for ax in np.atleast_1d(axes).flat[len(captures) :]:
-            ax.set_axis_off()
+    def draw_current(ax: Any, name: str) -> None:
+        hours, current = thin(samples[name]["time_s"] / 3600.0, samples[name]["current_a"], points=3000)
+        ax.plot(hours, current, linewidth=0.8)
+        ax.set(xlabel="time [h]", ylabel="A")
 
-    return plot(draw, rows=rows, columns=columns, salt=f"figure-{key}")
+    return _plots_by_load(list(samples), draw_current, key)
 
 
 def figure_28(experiment: Experiment) -> Figure:
-    """Draw a8 and a11 over SOC with their stability conditions."""
+    """Draw a8 and a11 over SOC with their stability conditions; without a plot if one is not met above SOC 0."""
     run = experiment.procedure.adaptive
     crossings = ", ".join(f"{c.parameter} at SOC {c.soc:.5f}" for c in run.crossings)
-    if min(c.soc for c in run.crossings) <= 0.0:
-        return _figure(
-            "28",
-            "a8 and a11 meet their stability conditions",
-            "",
-            experiment,
-            f"Not every crossing is above SOC 0: {crossings}.",
-        )
+    is_complete = min(c.soc for c in run.crossings) > 0.0
     return _figure(
         "28",
         "a8 and a11 meet their stability conditions",
-        plot(lambda axes: crossing_plot(axes, run), columns=2, salt="figure-28"),
+        plot(lambda axes: crossing_plot(axes, run), columns=2, salt="figure-28") if is_complete else "",
         experiment,
-        f"{crossings}.",
+        f"{crossings}." if is_complete else f"Not every crossing is above SOC 0: {crossings}.",
     )
 
 
@@ -217,54 +205,33 @@ def _errors(p: Procedure) -> Callable[[Any, str], None]:
 
 def figure_32(experiment: Experiment) -> Figure:
     """Draw the voltages under constant loads."""
+    svg = _plots_by_load(constant_loads(experiment.procedure), _voltages(experiment.procedure), "32")
+    return _figure("32", "Constant loads: actual and estimated voltage", svg, experiment, "")
+
+
+def _load_errors(
+    key: str, kind: str, loads: Callable[[Procedure], list[str]], printed_percent: float, experiment: Experiment
+) -> Figure:
+    """Draw the errors under constant loads or steps."""
+    p, names = experiment.procedure, loads(experiment.procedure)
+    reason = f"{_largest_error(p, names)} Printed: at most {printed_percent:g} %."
+    svg = _plots_by_load(names, _errors(p), key)
+    return _figure(key, f"{kind}: error", svg, experiment, reason, claims=(f"{kind.lower()}, largest",))
+
+
+def _load_currents(key: str, kind: str, loads: Callable[[Procedure], list[str]], experiment: Experiment) -> Figure:
+    """Draw the currents of constant loads or steps."""
     p = experiment.procedure
-    title = "Constant loads: actual and estimated voltage"
-    return _figure("32", title, _plots_by_load(constant_loads(p), _voltages(p), "32"), experiment, "")
+    captures = [capture for capture in p.captures if capture.name in loads(p)]
+    return _figure(key, f"{kind}: currents", _currents(captures, key), experiment, "")
 
 
-def figure_33(experiment: Experiment) -> Figure:
-    """Draw the errors under constant loads."""
-    p = experiment.procedure
-    svg = _plots_by_load(constant_loads(p), _errors(p), "33")
-    reason = f"{_largest_error(p, constant_loads(p))} Printed: at most {printed_values.MAX_CONSTANT:g} %."
-    return _figure("33", "Constant loads: error", svg, experiment, reason, claims=("constant loads, largest",))
-
-
-def figure_34(experiment: Experiment) -> Figure:
-    """Draw the currents of the constant loads."""
-    captures = experiment.procedure.captures_of(Kind.CONSTANT)[:MAX_LOADS]
-    return _figure("34", "Constant loads: currents", _currents(captures, "34"), experiment, "")
-
-
-def _step_voltage(experiment: Experiment, key: str, title: str, index: int) -> Figure:
+def _step_voltage(key: str, kind: str, index: int, experiment: Experiment) -> Figure:
+    """Draw the voltage under the steps with an index, or under the last ones."""
     p = experiment.procedure
     names = step_loads(p)[index : index + 1] or step_loads(p)[-1:]
-    return _figure(key, title, _plots_by_load(names, _voltages(p), key), experiment, _largest_error(p, names))
-
-
-def figure_35(experiment: Experiment) -> Figure:
-    """Draw the voltage under constant steps."""
-    return _step_voltage(experiment, "35", "Constant steps: actual and estimated voltage", 0)
-
-
-def figure_36(experiment: Experiment) -> Figure:
-    """Draw the currents of the steps."""
-    p = experiment.procedure
-    captures = [c for c in p.captures if c.name in step_loads(p)]
-    return _figure("36", "Steps: currents", _currents(captures, "36"), experiment, "")
-
-
-def figure_37(experiment: Experiment) -> Figure:
-    """Draw the voltage under variable steps."""
-    return _step_voltage(experiment, "37", "Variable steps: actual and estimated voltage", 1)
-
-
-def figure_38(experiment: Experiment) -> Figure:
-    """Draw the errors under steps."""
-    p = experiment.procedure
-    reason = f"{_largest_error(p, step_loads(p))} Printed: at most {printed_values.MAX_STEPS:g} %."
-    svg = _plots_by_load(step_loads(p), _errors(p), "38")
-    return _figure("38", "Steps: error", svg, experiment, reason, claims=("steps, largest",))
+    svg = _plots_by_load(names, _voltages(p), key)
+    return _figure(key, f"{kind} steps: actual and estimated voltage", svg, experiment, _largest_error(p, names))
 
 
 def figure_40(experiment: Experiment) -> Figure:
@@ -325,12 +292,12 @@ FIGURES: dict[str, Callable[[Experiment], Figure]] = {
     "30": figure_30,
     "31": figure_31,
     "32": figure_32,
-    "33": figure_33,
-    "34": figure_34,
-    "35": figure_35,
-    "36": figure_36,
-    "37": figure_37,
-    "38": figure_38,
+    "33": partial(_load_errors, "33", "Constant loads", constant_loads, printed_values.MAX_CONSTANT),
+    "34": partial(_load_currents, "34", "Constant loads", constant_loads),
+    "35": partial(_step_voltage, "35", "Constant", 0),
+    "36": partial(_load_currents, "36", "Steps", step_loads),
+    "37": partial(_step_voltage, "37", "Variable", 1),
+    "38": partial(_load_errors, "38", "Steps", step_loads, printed_values.MAX_STEPS),
     "40": figure_40,
     "41": figure_41,
     "42": figure_42,

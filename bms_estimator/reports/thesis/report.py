@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from bms_estimator.model.errors import UserError
@@ -94,29 +95,25 @@ class Report:
 
 def _builders(simulation: Simulation, experiment: Experiment) -> dict[str, Callable[[], Item]]:
     """Return the functions that build the items, by mark such as T5 or F19."""
-
-    def with_simulation(make: Callable[[Simulation], Item]) -> Callable[[], Item]:
-        return lambda: make(simulation)
-
-    def with_experiment(make: Callable[[Experiment], Item]) -> Callable[[], Item]:
-        return lambda: make(experiment)
-
     builders: dict[str, Callable[[], Item]] = {}
-    builders |= {f"T{key}": with_simulation(make) for key, make in simulation_tables.TABLES.items()}
-    builders |= {f"F{key}": with_simulation(make) for key, make in simulation_figures.FIGURES.items()}
-    builders |= {f"T{key}": with_experiment(make) for key, make in experiment_tables.TABLES.items()}
-    builders |= {f"F{key}": with_experiment(make) for key, make in experiment_figures.FIGURES.items()}
+    builders |= {f"T{key}": partial(make, simulation) for key, make in simulation_tables.TABLES.items()}
+    builders |= {f"F{key}": partial(make, simulation) for key, make in simulation_figures.FIGURES.items()}
+    builders |= {f"T{key}": partial(make, experiment) for key, make in experiment_tables.TABLES.items()}
+    builders |= {f"F{key}": partial(make, experiment) for key, make in experiment_figures.FIGURES.items()}
     if experiment.recorded is None:  # without captures these are computed from the printed values
         builders |= {f"F{key}": make for key, make in printed_pack.FIGURES.items()}
-    builders["TErrata"] = with_simulation(errata.table)
-    builders |= {f"F{key}": _diagram(key) for key in DIAGRAMS}
-    return builders
+    return (
+        builders
+        | {"TErrata": partial(errata.table, simulation)}
+        | {f"F{key}": partial(_diagram, key) for key in DIAGRAMS}
+    )
 
 
-def _diagram(key: str) -> Callable[[], Item]:
+def _diagram(key: str) -> Figure:
+    """Return a figure without anything to compute."""
     verdict = Reproduction.NO_DATA if key in FUEL_CELL_REASONS else Reproduction.GIVEN
     reason = FUEL_CELL_REASONS.get(key, "A diagram or photograph: there is nothing to compute.")
-    return lambda: Figure(key, DIAGRAMS[key], "", verdict, reason)
+    return Figure(key, DIAGRAMS[key], "", verdict, reason)
 
 
 def build(
@@ -200,9 +197,7 @@ def page(report: Report) -> str:
         counts=list(_counts(report)),
         label=label,
         name=name,
-        anchor=_anchor,
         short=_short,
-        is_brief=_is_brief,
         has_long_cell=has_long_cell,
         column_styles=_column_styles,
     )
@@ -221,11 +216,6 @@ def has_long_cell(table: Table) -> bool:
     return any(len(cell) > LONG_CELL for row in table.rows for cell in row)
 
 
-def _anchor(item: Item) -> str:
-    """Return the HTML id of an item."""
-    return f"{item.kind}-{item.key}".lower().replace(" ", "-")
-
-
 def _short(item: Item) -> str:
     """Return the short name of an item, such as T 5 or F 19."""
     if item.verdict is Reproduction.ADDED:
@@ -239,11 +229,6 @@ def _counts(report: Report) -> Iterator[tuple[Reproduction, int, str]]:
         count = sum(item.verdict is verdict for item in report.items)
         if count:
             yield verdict, count, "diagram, photograph or input" if verdict is Reproduction.GIVEN else verdict.value
-
-
-def _is_brief(item: Item) -> bool:
-    """Return True for a diagram or photograph, which has only a title."""
-    return isinstance(item, Figure) and not item.svg and item.verdict is Reproduction.GIVEN
 
 
 def _column_styles(table: Table) -> list[str]:

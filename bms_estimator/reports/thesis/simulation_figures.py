@@ -4,13 +4,14 @@ Numbers in parentheses are equations of the thesis, and E1 to E37 are its errata
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun
 from bms_estimator.calibration.thesis.prediction import Prediction
-from bms_estimator.kernels.cell_model.chen_mora import emf, r_s
+from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, emf, r_s, r_tl, r_ts
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, mittag_leffler, series_coefficients
 from bms_estimator.model.arrays import Floats
 from bms_estimator.plot.style import COLORS, FAINT, thin
@@ -32,7 +33,6 @@ from bms_estimator.reports.thesis.simulation import (
     SOC_GRID,
     STATIC_SOC,
     Simulation,
-    element,
     mean_error_percent,
 )
 from bms_estimator.reports.thesis.theorem_4_1_2 import PRODUCTS
@@ -41,49 +41,27 @@ FULL_SOC_GRID = np.linspace(0.0, 1.0, 1001)
 """SOC grid over the full range."""
 
 
-def curve(key: str, title: str, unit: str, values: Floats, limits: tuple[float, float] | None = None) -> Figure:
+CURVES: dict[str, tuple[str, str, Callable[[float, Floats], float], tuple[float, float] | None]] = {
+    "3": ("Open-circuit voltage E_o over SOC, (2.10)", "V", emf, None),
+    "4": ("R_s over SOC, (2.9)", "Ω", r_s, None),
+    "5": ("R_ts over SOC, (2.5)", "Ω", r_ts, None),
+    "6": ("C_ts over SOC, (2.7)", "F", c_ts, None),
+    "7": ("R_tl over SOC, (2.6)", "Ω", r_tl, (0.0, 0.5)),
+    "8": ("C_tl over SOC, (2.8)", "F", c_tl, None),
+}
+"""Title, unit, function of SOC and parameters, and limits of the vertical axis of the figures of one curve, by number."""
+
+
+def curve(key: str, s: Simulation) -> Figure:
     """Draw an element or the EMF of the cell over SOC."""
+    title, unit, function, limits = CURVES[key]
 
     def draw(axes: Any) -> None:
-        axes.plot(FULL_SOC_GRID, values)
-        axes.set(xlabel="SOC $x_1$", ylabel=unit, xlim=(0.0, 1.0))
-        if limits is not None:
-            axes.set_ylim(*limits)
+        axes.plot(FULL_SOC_GRID, [function(x, s.cell.a) for x in FULL_SOC_GRID])
+        axes.set(xlabel="SOC $x_1$", ylabel=unit, xlim=(0.0, 1.0), ylim=limits)
 
     reason = f"From Chen and Mora's parameters. {NO_VALUES}"
     return Figure(key, title, plot(draw, salt=f"figure-{key}"), Reproduction.RECOMPUTED, reason)
-
-
-def figure_3(s: Simulation) -> Figure:
-    """Draw the open-circuit voltage E_o over SOC."""
-    return curve(
-        "3", "Open-circuit voltage E_o over SOC, (2.10)", "V", np.array([emf(x, s.cell.a) for x in FULL_SOC_GRID])
-    )
-
-
-def figure_4(s: Simulation) -> Figure:
-    """Draw R_s."""
-    return curve("4", "R_s over SOC, (2.9)", "Ω", np.array([r_s(x, s.cell.a) for x in FULL_SOC_GRID]))
-
-
-def figure_5(s: Simulation) -> Figure:
-    """Draw R_ts."""
-    return curve("5", "R_ts over SOC, (2.5)", "Ω", element("R_ts", s.cell.a, FULL_SOC_GRID))
-
-
-def figure_6(s: Simulation) -> Figure:
-    """Draw C_ts."""
-    return curve("6", "C_ts over SOC, (2.7)", "F", element("C_ts", s.cell.a, FULL_SOC_GRID))
-
-
-def figure_7(s: Simulation) -> Figure:
-    """Draw R_tl."""
-    return curve("7", "R_tl over SOC, (2.6)", "Ω", element("R_tl", s.cell.a, FULL_SOC_GRID), (0.0, 0.5))
-
-
-def figure_8(s: Simulation) -> Figure:
-    """Draw C_tl."""
-    return curve("8", "C_tl over SOC, (2.8)", "F", element("C_tl", s.cell.a, FULL_SOC_GRID))
 
 
 def figure_9(_: Simulation) -> Figure:
@@ -326,13 +304,7 @@ def figure_43(s: Simulation) -> Figure:
     )
 
 
-FIGURES: dict[str, Callable[[Simulation], Figure]] = {
-    "3": figure_3,
-    "4": figure_4,
-    "5": figure_5,
-    "6": figure_6,
-    "7": figure_7,
-    "8": figure_8,
+FIGURES: dict[str, Callable[[Simulation], Figure]] = {key: partial(curve, key) for key in CURVES} | {
     "9": figure_9,
     "10": figure_10,
     "13": figure_13,
