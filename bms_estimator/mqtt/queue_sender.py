@@ -196,10 +196,11 @@ class QueueSender:
             return False
         self._rejected += rejection is not None
         self._outbox.acknowledge(queued.number, rejection.reason if rejection else "")
-        self._update_stats()
+        self.update_stats()
         self._acknowledged.set()
         return True
 
-    def _update_stats(self) -> None:
+    def update_stats(self) -> None:
+        """Update the numbers of dropped and waiting messages."""
         self._delivery.drops = self._outbox.dropped + self._rejected
         self._delivery.waiting = self._outbox.waiting

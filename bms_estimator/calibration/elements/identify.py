@@ -6,7 +6,7 @@ its temperature: its replays then use a fit to the other captures. If such fits 
 scored, because a fit without the only drive, or the only HPPC, extrapolates.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
@@ -116,7 +116,7 @@ class Candidate:
 
     def __init__(self, runs: list[Run], equations: list[NormalEquations], cell: CellModel, *, refine_ocv: bool) -> None:
         self._runs, self._equations, self._cell, self._refine = runs, equations, cell, refine_ocv
-        self._scale_ohm, self.holds_back = _resistance_scale(runs, cell), True
+        self._scale_ohm = _resistance_scale(runs, cell)
         self.fit = self._fit(range(len(runs)))
 
     @cached_property
@@ -128,21 +128,16 @@ class Candidate:
         """Return, for each capture, the relative correction of its counted charge with which its voltage matches the fit best."""
         return [equations_of_run.miscount(self.fit.coefficients) for equations_of_run in self._equations]
 
-    def is_held_back(self, j: int) -> bool:
-        """Return True if the fit omits capture ``j`` for its score, because another one is within ``MIN_SPAN_K`` of its temperature.
-
-        If ``holds_back`` is False, the fit omits none.
-        """
-        mean_c = [run.mean_c for run in self._runs]
-        return self.holds_back and any(k != j and abs(mean_c[k] - mean_c[j]) < MIN_SPAN_K for k in range(len(mean_c)))
-
-    def outcome(self, before: Floats, after: Floats, left_out: tuple[str, ...]) -> Identification:
+    def outcome(
+        self, before: Floats, after: Floats, left_out: tuple[str, ...], held_back: Collection[int]
+    ) -> Identification:
         """Return the identification with this variant's cell.
 
         Args:
             before: Scores with the given cell [%].
             after: Scores with this variant's cell [%].
             left_out: Names of captures without excitation.
+            held_back: Indices of the captures that the fit omits for their score.
         """
         fits = tuple(
             CaptureFit(
@@ -155,7 +150,7 @@ class Candidate:
                 voltage_rms_v=voltage_rms_v(self.cell, run),
                 score_before=float(before[j]),
                 score_after=float(after[j]),
-                held_back=self.is_held_back(j),
+                held_back=j in held_back,
             )
             for j, run in enumerate(self._runs)
         )
@@ -173,9 +168,18 @@ class Candidate:
             score_after=geometric_mean(after),
         )
 
-    def cell_for(self, j: int) -> CellModel:
+    def scores(self, held_back: Collection[int], work: WorkCounter) -> Floats:
+        """Return the score of each capture's replays [%]."""
+        return np.array(
+            [
+                interval_score(self._cell_for(j, held_back), run.capture, run.soc, work.part(run.soc.size))
+                for j, run in enumerate(self._runs)
+            ]
+        )
+
+    def _cell_for(self, j: int, held_back: Collection[int]) -> CellModel:
         """Return the cell for the replays of capture ``j``. Its fit omits this capture if it is held back."""
-        if not self.is_held_back(j):
+        if j not in held_back:
             return self.cell
         others = [k for k in range(len(self._runs)) if k != j]
         return self._cell_from(self._fit(others), others)
@@ -209,6 +213,14 @@ def equations_of(runs: list[Run], cell: CellModel) -> list[NormalEquations]:
             run.miscount,
         )
         for run in runs
+    ]
+
+
+def _held_back(runs: list[Run]) -> list[int]:
+    """Return the captures that a fit omits for their score, because another one is within ``MIN_SPAN_K`` of its temperature."""
+    mean_c = [run.mean_c for run in runs]
+    return [
+        j for j, c in enumerate(mean_c) if any(k != j and abs(mean_c[k] - c) < MIN_SPAN_K for k in range(len(runs)))
     ]
 
 
@@ -277,21 +289,19 @@ def identify(
     equations = equations_of(runs, cell)
     candidates = [Candidate(runs, equations, cell, refine_ocv=refine) for refine in variants]
     before = np.array([interval_score(cell, run.capture, run.soc, work.part(run.soc.size)) for run in runs])
-    after = [_scores(candidate, runs, work) for candidate in candidates]
+    held_back = _held_back(runs)
+    after = [candidate.scores(held_back, work) for candidate in candidates]
     best = len(after) - 1  # the last candidate, if no capture has a score
     if np.isfinite(before).any():
         # scores of captures that are not held back favor the variant with more unknowns
-        held_back = [j for j in range(len(runs)) if candidates[0].is_held_back(j)]
         given, refined = (
             geometric_mean(scores[held_back] if held_back else scores) for scores in (after[0], after[-1])
         )
         best = int((EQUAL_SCORE_RATIO if held_back else 1.0) * refined < given)  # index in ``candidates``
-    outcome = candidates[best].outcome(before, after[best], left_out)
-    if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before and any(c.held_back for c in outcome.captures):
-        candidates[best].holds_back = False
-        own = candidates[best].outcome(
-            before, _scores(candidates[best], runs, WorkCounter(no_progress, samples)), left_out
-        )
+    outcome = candidates[best].outcome(before, after[best], left_out, held_back)
+    if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before and held_back:
+        own_scores = candidates[best].scores((), WorkCounter(no_progress, samples))
+        own = candidates[best].outcome(before, own_scores, left_out, ())
         outcome = min(outcome, own, key=lambda scored: scored.score_after)
     unknown = [clean for clean in excited if initial_soc is None and clean.name not in initial_socs]
     undetermined = tuple(
@@ -302,16 +312,6 @@ def identify(
     if outcome.score_after > EQUAL_SCORE_RATIO * outcome.score_before:
         raise UserError("\n".join([_worse_replays(outcome), *undetermined]))
     return replace(outcome, undetermined_starts=undetermined)
-
-
-def _scores(candidate: Candidate, runs: list[Run], work: WorkCounter) -> Floats:
-    """Return the score of each capture's replays with ``Candidate.cell_for`` [%]."""
-    return np.array(
-        [
-            interval_score(candidate.cell_for(j), run.capture, run.soc, work.part(run.soc.size))
-            for j, run in enumerate(runs)
-        ]
-    )
 
 
 def _correct_miscounts(runs: list[Run], cell: CellModel, work: WorkCounter, *, refine_ocv: bool) -> list[Run]:

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import math
 import secrets
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from typing import Self
 
 import structlog
@@ -174,7 +174,7 @@ class MqttSink:
     ) -> None:
         self._requests, self._delivery = requests, delivery
         self._denied = DeniedTopics(delivery, self._republish, first_delay_s)
-        self._outbox_sender = OutboxSender(outbox, delivery, self._denied, first_delay_s)
+        self._outbox, self._sender = outbox, QueueSender(outbox, delivery, self._denied, first_delay_s)
         self._birth_delay_s = birth_delay_s
         self._messages = MessageBuilder(
             settings.base_topic, device, sample_period_s, home_assistant, alarms, venus_limits
@@ -201,13 +201,19 @@ class MqttSink:
         """Queue a snapshot for publication without waiting."""
         if self._task is not None and self._task.done():
             self._task.result()  # only an internal error ends the task: raise it
-        self._outbox_sender.put(self._messages.guaranteed_messages(self._last, snapshot))
+        for message in self._messages.guaranteed_messages(self._last, snapshot):
+            self._queue(message)
         self._unsent = self._last = snapshot
         self._wake.set()
 
     def publish_raw(self, topic: str, payload: bytes, on_result: OnResult) -> None:
         """Publish a message of another component at QoS 1, queued during an outage like states, and report its result."""
-        self._outbox_sender.put([Message(topic, payload, 1, retain=False)], on_result)
+        self._queue(Message(topic, payload, 1, retain=False), on_result)
+
+    def _queue(self, message: Message, on_result: OnResult | None = None) -> None:
+        """Queue a message until the broker acknowledges it. ``on_result`` receives its result."""
+        self._outbox.put(message, on_result)
+        self._sender.update_stats()
 
     async def __aenter__(self) -> Self:
         """Start connecting to the broker."""
@@ -236,7 +242,7 @@ class MqttSink:
                 await self._subscribe(connection)
                 others += [
                     tasks.create_task(self._availability.expect_echo()),
-                    tasks.create_task(self._outbox_sender.send(connection)),
+                    tasks.create_task(self._sender.send(connection)),
                 ]
                 await self._send(connection)
                 for task in others:
@@ -281,7 +287,7 @@ class MqttSink:
             if self._reconnect_loop.closing.is_set():
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(QUEUE_DRAIN_TIMEOUT_S):
-                        await self._outbox_sender.wait_until_empty()
+                        await self._sender.wait_until_empty()
                 await self._publish(connection, self._messages.offline_messages())
                 return
 
@@ -314,17 +320,3 @@ class MqttSink:
 
     def _topic(self, name: str) -> str:
         return f"{self._messages.root}/{name}"
-
-
-class OutboxSender(QueueSender):
-    """Fills an outbox and sends its messages. The parameters are those of ``QueueSender``."""
-
-    def __init__(self, outbox: Outbox, delivery: DeliveryStats, denied: DeniedTopics, first_delay_s: float) -> None:
-        super().__init__(outbox, delivery, denied, first_delay_s)
-        self._outbox_to_fill = outbox
-
-    def put(self, messages: Iterable[Message], on_result: OnResult | None = None) -> None:
-        """Queue messages until the broker acknowledges them. ``on_result`` receives the result of each."""
-        for message in messages:
-            self._outbox_to_fill.put(message, on_result)
-        self._update_stats()
