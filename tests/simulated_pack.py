@@ -17,7 +17,7 @@ from bms_estimator.settings.observer import BOARD
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_bank import BankCells, BankHistory, SimulatedBank
 from bms_estimator.sources.source import ReceivedSamples
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 from tests.scripted_source import Collector, ScriptedSource
 
 CELLS, CAPACITY_AH, STEP_S, BLOCK = 6, 20.0, 10.0, 30

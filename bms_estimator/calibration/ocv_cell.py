@@ -8,9 +8,12 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import FULL_SOC
 from bms_estimator.calibration.cleaning.clean_capture import remove_glitches
-from bms_estimator.calibration.elements.generic_prior import curve as generic_curve
-from bms_estimator.calibration.elements.generic_prior import nearest_generic_cell, scaled_generic_ladder
-from bms_estimator.calibration.elements.initial_elements import initial_elements
+from bms_estimator.calibration.elements.initial_elements import curve as generic_curve
+from bms_estimator.calibration.elements.initial_elements import (
+    initial_elements,
+    nearest_generic_cell,
+    scaled_generic_ladder,
+)
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, Points, fit_chen_mora
 from bms_estimator.calibration.ocv.hysteresis import (
     ExternalCurve,

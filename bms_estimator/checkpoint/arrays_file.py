@@ -26,7 +26,7 @@ from bms_estimator.checkpoint.run_file import CHECKSUM_BYTES, add_checksum, veri
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.host import BootTimestamp
-from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
+from bms_estimator.process.state_folder import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.pack import Settings
 
 

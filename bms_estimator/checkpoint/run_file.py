@@ -19,8 +19,7 @@ import numpy as np
 import structlog
 
 from bms_estimator.model.payloads.health import Totals
-from bms_estimator.process.private_file import overwrite_private, read_private, write_private
-from bms_estimator.process.state_folder import is_locked
+from bms_estimator.process.state_folder import is_locked, overwrite_private, read_private, write_private
 from bms_estimator.settings.pack import BmsSettings, Settings
 from bms_estimator.settings.sources.linux import BleSource
 from bms_estimator.telemetry.publish_window import ChargeEnergy, new_totals

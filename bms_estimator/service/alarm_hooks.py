@@ -13,7 +13,7 @@ from bms_estimator.service.hook_check import require_output
 from bms_estimator.service.job_hook import CommandHook, PublishHook, PublishRaw
 from bms_estimator.service.relay_hook import RelayBoard, RelayHook
 from bms_estimator.settings.alarms import AlarmHook
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 
 CLOSE_TIMEOUT_S = 2.0
 """Timeout of running hooks at shutdown [s]."""

@@ -17,8 +17,8 @@ from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.causes import BoardResets
+from bms_estimator.telemetry.alarms.definitions import Change
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import cell_alarm_inputs
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from bms_estimator.settings.alarm_limits import short_limit_a
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload, remaining_capacity_ah
 from bms_estimator.telemetry.health import (
     contradicts_device,

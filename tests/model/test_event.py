@@ -10,7 +10,7 @@ from bms_estimator.model.payloads.health import AnchorReport
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.alarms.message import AlarmMessage, alarm_payload
+from bms_estimator.telemetry.alarms.definitions import AlarmMessage, alarm_payload
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 AT_41_C = f"no data at 41 C, the cell file knows 25 C: {InputFault.TEMPERATURE.text}"

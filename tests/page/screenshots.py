@@ -28,7 +28,7 @@ from bms_estimator.settings.outputs import PageSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.setup.page.setup_server import SetupServer
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
-from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.simulated_pack import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.source import ReceivedSamples
 from tests.device_line import running_device

@@ -11,7 +11,7 @@ from playwright.async_api import Page, expect
 from bms_estimator.settings.outputs import PageSettings
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.setup.page.setup_server import SetupServer
-from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.simulated_pack import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from tests.command_line import run
 from tests.device_line import running_device

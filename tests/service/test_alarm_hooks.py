@@ -27,7 +27,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.port_list import NO_BOARD, KnownBoardFile
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.scripted_source import Collector

@@ -13,7 +13,7 @@ from bms_estimator.mqtt.connection import OnResult
 from bms_estimator.service import job_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.settings.alarms import AlarmHook
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import until

@@ -14,7 +14,7 @@ from bms_estimator.service import relay_hook
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.relay_hook import FIRST_HOLD_S
 from bms_estimator.settings.alarms import AlarmHook
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 from tests.patience import LONG_S
 from tests.sinks.snapshots import SOC_LOW_ALARM
 

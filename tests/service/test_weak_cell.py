@@ -17,7 +17,7 @@ from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_bank import BankCells
 from bms_estimator.sources.source import ReceivedSamples
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 from tests.pack_model.bank_cycles import ONE_C, cycle, new_bank
 from tests.scripted_source import Collector, ScriptedSource
 

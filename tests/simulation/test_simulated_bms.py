@@ -12,7 +12,7 @@ import pytest
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.bms_responses import BMS_RESPONSES
-from bms_estimator.simulation.simulated_bms import MAX_CELL_DEVIATION_V, BmsFault, SimulatedBms
+from bms_estimator.simulation.simulated_pack import MAX_CELL_DEVIATION_V, BmsFault, SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.captures.raw_capture import make_header
 from bms_estimator.sources.captures.recorder import CaptureRecorder

@@ -7,12 +7,11 @@ from contextlib import ExitStack
 import pytest
 
 from bms_estimator.settings.pack import Settings
-from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS
+from bms_estimator.simulation.simulated_pack import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
-from bms_estimator.sources import paired_source
-from bms_estimator.sources.factory import open_source
-from bms_estimator.sources.paired_source import PairedSource
+from bms_estimator.sources import factory
+from bms_estimator.sources.factory import PairedSource, open_source
 from bms_estimator.sources.source import ReceivedSamples
 from tests.device_line import running_device
 from tests.patience import LONG_S
@@ -50,8 +49,8 @@ class Devices:
 
 @pytest.fixture
 def devices(monkeypatch: pytest.MonkeyPatch) -> Iterator[Devices]:
-    monkeypatch.setattr(paired_source, "MAX_AGE_FLOOR_S", 1.0)
-    monkeypatch.setattr(paired_source, "MAX_AGE_PERIODS", 0.5)
+    monkeypatch.setattr(factory, "MAX_AGE_FLOOR_S", 1.0)
+    monkeypatch.setattr(factory, "MAX_AGE_PERIODS", 0.5)
     devices = Devices()
     yield devices
     devices.close()

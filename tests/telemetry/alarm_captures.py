@@ -18,7 +18,7 @@ from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header
 from bms_estimator.sources.captures.replay import Replay, open_capture
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 from tests.estimator.anywhere.cases import OXIDE
 from tests.estimator.anywhere.truth import curve_of, simulate
 from tests.scripted_source import Collector

@@ -35,7 +35,7 @@ from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.kernel_warm_up import load_forecast_kernels
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.replay import Replay, no_samples_error, open_capture
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 
 MAX_BLOCK_S = 1.0
 """Maximum duration of a block [s]. Alarms are evaluated after each block, by the capture's clock."""

@@ -21,8 +21,7 @@ from rich.text import Text
 from bms_estimator.calibration.automatic.calibrate import Calibration, calibrate
 from bms_estimator.calibration.guided_test.plan import LONG, SHORT
 from bms_estimator.cli.cell.calibrate_live import RelayOptions, run_guided_test
-from bms_estimator.cli.cell.calibration_input import given_cell, load_captures_and_curves, split_inputs
-from bms_estimator.cli.cell.calibration_session import open_session
+from bms_estimator.cli.cell.calibration_session import given_cell, load_captures_and_curves, open_session, split_inputs
 from bms_estimator.cli.cell.load_switch import relay_program
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,

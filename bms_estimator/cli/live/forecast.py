@@ -39,8 +39,8 @@ from bms_estimator.process.state_folder import state_folder
 from bms_estimator.reports.report_parts import duration_text, number
 from bms_estimator.service.request_handlers import as_json_data
 from bms_estimator.settings.pack import Settings
+from bms_estimator.sources.captures.curves import read_trip
 from bms_estimator.sources.captures.replay import open_capture
-from bms_estimator.sources.captures.trip_file import read_trip
 from bms_estimator.telemetry.state import CUTOFF_FIELDS, cutoff_text
 
 PLOT_FORMATS = (".png", ".svg", ".pdf")

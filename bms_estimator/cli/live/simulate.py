@@ -18,9 +18,15 @@ from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.simulation.bms_responses import BMS_RESPONSES
 from bms_estimator.simulation.esphome_node import SimulatedNode
-from bms_estimator.simulation.simulated_bms import SimulatedBms, SimulatedStack
 from bms_estimator.simulation.simulated_meter import METERS, SimulatedMeter
-from bms_estimator.simulation.simulated_pack import LOADS, LoadName, PackWithRelay, SimulatedPack
+from bms_estimator.simulation.simulated_pack import (
+    LOADS,
+    LoadName,
+    PackWithRelay,
+    SimulatedBms,
+    SimulatedPack,
+    SimulatedStack,
+)
 from bms_estimator.simulation.virtual_board import RATE_HZ_AT_RESET, VirtualBoard
 
 DEVICE_PROTOCOLS = (*METERS, *BMS_RESPONSES)

@@ -16,8 +16,7 @@ from bms_estimator.installation import paths
 from bms_estimator.installation.program_copy import named_files
 from bms_estimator.model.config_file import parse_toml
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.private_file import write_private
-from bms_estimator.process.state_folder import instance_lock, state_folder_path
+from bms_estimator.process.state_folder import instance_lock, state_folder_path, write_private
 from bms_estimator.settings.pack import Settings, load_settings
 
 SETTINGS, STATE = "settings", "state"

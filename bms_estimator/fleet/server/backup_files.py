@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from bms_estimator.fleet.nats.stream_snapshot import StreamInfo
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
+from bms_estimator.process.state_folder import UnsafeFileError, read_private, write_private
 
 LIST_FILE = "backup.json"
 """Name of the file that lists all others."""

@@ -22,7 +22,7 @@ from bms_estimator.fleet.server.disk_space import GB
 from bms_estimator.fleet.server.jwt_claims import ACCOUNT, BEARER_ROLES, OPERATOR, Key, Role, Tenant
 from bms_estimator.fleet.server.nats_config import Accounts
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
+from bms_estimator.process.state_folder import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.fleet import TenantSettings
 
 CLAIMS = "claims.json"

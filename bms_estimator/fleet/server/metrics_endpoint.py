@@ -26,7 +26,7 @@ async def metrics_endpoint(listen: str | None, node: Node, watch: NodeWatch) -> 
         yield
         return
     from bms_estimator.fleet.metrics.families import families  # noqa: PLC0415 - loading takes time
-    from bms_estimator.sinks.exports.metrics_server import MetricsServer  # noqa: PLC0415
+    from bms_estimator.sinks.exports.prometheus import MetricsServer  # noqa: PLC0415
 
     async def collect() -> "Iterable[Metric]":
         return families(*await asyncio.gather(watch.node_state(node), watch.tenant_states()))

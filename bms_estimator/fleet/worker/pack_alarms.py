@@ -22,9 +22,15 @@ from bms_estimator.model.events import Event, EventText, fit_event, input_fault_
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.telemetry.alarms.causes import LOSS_TEXTS, PROBE_TEXT, WRONG_CLOCK_TEXT, find_unknown, suspect_texts
-from bms_estimator.telemetry.alarms.definitions import MODEL_SUSPECTS, QUANTITIES, SENSOR_SUSPECTS, EvaluationKernel
-from bms_estimator.telemetry.alarms.message import AlarmMessage as AlarmContent
-from bms_estimator.telemetry.alarms.message import RaisedAlarm, alarm_payload
+from bms_estimator.telemetry.alarms.definitions import (
+    MODEL_SUSPECTS,
+    QUANTITIES,
+    SENSOR_SUSPECTS,
+    EvaluationKernel,
+    RaisedAlarm,
+    alarm_payload,
+)
+from bms_estimator.telemetry.alarms.definitions import AlarmMessage as AlarmContent
 from bms_estimator.telemetry.cells import cell_alarm_inputs
 from bms_estimator.telemetry.health import identifier_counters, last_anchor, last_change, suspicions
 

@@ -1,20 +1,73 @@
-"""Prometheus sink: serves metrics of the last snapshot. Needs prometheus-client.
+"""Prometheus sink: serves metrics of the last snapshot over HTTP, in the event loop. Needs prometheus-client.
 
 Metrics have the names of the payloads' fields with Prometheus' base unit as suffix: ``voltage_v`` is
 ``bms_voltage_volts``, ``energy_out_kwh`` is ``bms_energy_out_joules_total``.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+import contextlib
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from typing import NamedTuple, Self
 
+from aiohttp import web
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.registry import Collector
 
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.quantity import quantity
+from bms_estimator.process.listener import CONNECTIONS, Listener
 from bms_estimator.settings.outputs import PrometheusSettings
-from bms_estimator.sinks.exports.metrics_server import MetricsServer
+
+SHUTDOWN_TIMEOUT_S = 1.0
+"""Shutdown timeout of open connections [s]."""
+
+
+class _Scrape(Collector):
+    """Metrics of one scrape."""
+
+    def __init__(self, metrics: Iterable[Metric]) -> None:
+        self._metrics = metrics
+
+    def collect(self) -> Iterable[Metric]:
+        return self._metrics
+
+
+class MetricsServer:
+    """Server on one address while the context lasts. An address that is in use or does not exist yet is retried.
+
+    Args:
+        host, port: Listening address.
+        collect: Returns the metrics; called at each scrape.
+    """
+
+    def __init__(self, host: str, port: int, collect: Callable[[], Awaitable[Iterable[Metric]]]) -> None:
+        self._host, self._port, self._collect = host, port, collect
+        self._stack = contextlib.AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        """Start listening."""
+        server = web.Server(self._answer)
+        listener = Listener(server)
+        await listener.open_or_retry(self._host, self._port, "metrics")
+        self._stack.push_async_callback(server.shutdown, SHUTDOWN_TIMEOUT_S)
+        self._stack.push_async_callback(listener.close)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Stop listening and close all connections."""
+        await self._stack.aclose()
+
+    async def _answer(self, request: web.BaseRequest) -> web.StreamResponse:
+        """Answer a scrape on any path, in the format of its Accept header."""
+        # the connection has no deadline while its request is handled
+        with CONNECTIONS.serving(request.transport):
+            if request.method not in {"GET", "HEAD"}:
+                return web.Response(status=405, headers={"Allow": "GET, HEAD"})
+            encode, content_type = choose_encoder(request.headers.get("Accept", ""))
+            body = encode(_Scrape(await self._collect()))
+            return web.Response(body=body, headers={"Content-Type": content_type})
 
 
 class Unit(NamedTuple):

@@ -21,11 +21,12 @@ from bms_estimator.settings.outputs import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import (
     VALUES,
     DiscoveryInputs,
+    cell_key,
     check_names,
     discovery,
     discovery_topic,
+    entities,
 )
-from bms_estimator.sinks.home_assistant.entities import cell_key, entities
 from bms_estimator.sinks.mqtt.topics import schema
 from bms_estimator.sinks.mqtt.venus_os import venus_battery
 

@@ -13,7 +13,7 @@ import structlog
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
-from bms_estimator.process.private_file import UnsafeFileError, read_private, write_private
+from bms_estimator.process.state_folder import UnsafeFileError, read_private, write_private
 
 STORED_FIELDS = ("serial", "divider", "volts_per_ampere", "ratiometric", "current_zero", "bandgap_v")
 """Fields of a board's hello that are stored: the serial number and all of the calibration."""

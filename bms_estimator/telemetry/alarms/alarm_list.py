@@ -14,8 +14,16 @@ from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.telemetry.alarms.causes import Causes
-from bms_estimator.telemetry.alarms.definitions import QUANTITIES, AlarmDefinitions, EvaluationKernel, SavedState
-from bms_estimator.telemetry.alarms.message import AlarmMessage, Change, RaisedAlarm, alarm_payload
+from bms_estimator.telemetry.alarms.definitions import (
+    QUANTITIES,
+    AlarmDefinitions,
+    AlarmMessage,
+    Change,
+    EvaluationKernel,
+    RaisedAlarm,
+    SavedState,
+    alarm_payload,
+)
 
 ALWAYS_WATCHED: frozenset[AlarmName] = frozenset(("sensor_fault", "link_lost", "alarm_state_lost"))
 """Alarms that are watched even before the first sample."""

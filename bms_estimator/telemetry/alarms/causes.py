@@ -11,7 +11,7 @@ from bms_estimator.model.arrays import ProbeBlock, SampleBlock, SampleStatus
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS, Quantity
 from bms_estimator.settings.alarms import AlarmName
-from bms_estimator.telemetry.alarms.message import AlarmMessage, RaisedAlarm
+from bms_estimator.telemetry.alarms.definitions import AlarmMessage, RaisedAlarm
 from bms_estimator.telemetry.cells import NO_FAULTY_CELL, CellAlarmInput
 from bms_estimator.telemetry.state import UNKNOWN_SOC, missing_margin_reason
 

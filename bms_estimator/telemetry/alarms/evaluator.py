@@ -27,10 +27,10 @@ from bms_estimator.telemetry.alarms.definitions import (
     QUANTITIES,
     SENSOR_SUSPECTS,
     AlarmDefinitions,
+    Change,
     decode,
     encode,
 )
-from bms_estimator.telemetry.alarms.message import Change
 from bms_estimator.telemetry.cells import CellAlarmInputs
 from bms_estimator.telemetry.health import suspicions
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from bms_estimator.fleet.ingest.batch_columns import BatchError
 from bms_estimator.fleet.ingest.batch_samples import BatchReader
 from bms_estimator.fleet.ingest.ingest import decode_batch
-from bms_estimator.telemetry.alarms.message import Change
+from bms_estimator.telemetry.alarms.definitions import Change
 from tests.benchmarks.table import Row
 from tests.firmware.test_reset_loop import MAX_RISES, RESETS, reset_loop
 from tests.fleet.ingest.platform import arrow_with_shared_columns

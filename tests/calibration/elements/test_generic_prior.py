@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from bms_estimator.calibration.elements.generic_prior import (
+from bms_estimator.calibration.elements.initial_elements import (
     RESTS_STD,
+    InitialElements,
     curve,
     nearest_generic_cell,
     scaled_generic_ladder,
 )
-from bms_estimator.calibration.elements.initial_elements import InitialElements
 from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.captures.curves import read_curve
 

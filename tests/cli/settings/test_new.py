@@ -18,7 +18,7 @@ from bms_estimator.settings.observer import ChargeLimits
 from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.simulation.esphome_node import SimulatedNode
-from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.simulation.simulated_pack import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial.device_detection import BoardClient
 from tests.command_line import PROGRAM, run

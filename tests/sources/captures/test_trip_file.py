@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.trip_file import read_trip
+from bms_estimator.sources.captures.curves import read_trip
 
 
 def write(folder: Path, text: str) -> Path:

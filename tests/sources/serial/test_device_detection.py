@@ -9,8 +9,8 @@ import pytest
 from bms_estimator.protocols.devices import daly, jbd, jk, junctek
 from bms_estimator.protocols.devices.pylontech import PylontechProtocol
 from bms_estimator.simulation.bms_responses import BMS_RESPONSES
-from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.simulated_meter import METERS
+from bms_estimator.simulation.simulated_pack import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial import device_detection, port_list
 from bms_estimator.sources.serial.device_detection import DetectedDevice
