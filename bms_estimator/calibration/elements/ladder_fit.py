@@ -1,6 +1,6 @@
 """Fit of an RC ladder's resistances to cleaned captures by regularized linear least squares with all resistances positive.
 
-Module ``ladder_columns`` describes the model, which is linear in all unknowns. All constants of this module were chosen by
+Module ``normal_equations`` describes the model, which is linear in all unknowns. All constants of this module were chosen by
 the score of replays on drive cycles that were not part of the fit.
 """
 

@@ -76,7 +76,7 @@ FLOW = np.dtype(
     ],
     align=True,
 )
-"""Total charge and energy (``telemetry.lifetime_totals.ChargeEnergy``) and the sums of ``ChargeEnergyMeter``."""
+"""Total charge and energy (``telemetry.publish_window.ChargeEnergy``) and the sums of ``ChargeEnergyMeter``."""
 PACK_FIT = np.dtype(
     [
         # stream sequence number of the message with the fit; 0: none

@@ -1,6 +1,6 @@
 """Dialects: column names and sign conventions of cyclers, libraries and public data sets.
 
-Names are compared by ``units.fold`` and without their unit, so that ``Test_Time(s)``, ``Test Time (s)`` and ``TestTime``
+Names are compared by ``cell_values.fold`` and without their unit, so that ``Test_Time(s)``, ``Test Time (s)`` and ``TestTime``
 are the same name.
 """
 
