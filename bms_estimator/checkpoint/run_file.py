@@ -21,7 +21,7 @@ import structlog
 from bms_estimator.model.payloads.health import Totals
 from bms_estimator.process.state_folder import is_locked, overwrite_private, read_private, write_private
 from bms_estimator.settings.pack import BmsSettings, Settings
-from bms_estimator.settings.sources.linux import BleSource
+from bms_estimator.settings.sources.source import BleSource
 from bms_estimator.telemetry.publish_window import ChargeEnergy, new_totals
 
 SERIAL_IDS = "/dev/serial/by-id/"

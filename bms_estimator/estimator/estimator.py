@@ -7,8 +7,7 @@ from typing import Self
 import numpy as np
 
 from bms_estimator.estimator.anchor_settings import between_limits
-from bms_estimator.estimator.curve_change import return_to_cell_file, use_curves
-from bms_estimator.estimator.fitted_state import FittedState, write_fitted_state
+from bms_estimator.estimator.fitted_state import FittedState, return_to_cell_file, use_curves, write_fitted_state
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, add_reference, complete_row

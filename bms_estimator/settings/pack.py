@@ -26,8 +26,8 @@ from bms_estimator.settings.outputs import (
 from bms_estimator.settings.sensor import ALLOWED_WITH_SOURCE, SensorSettings
 from bms_estimator.settings.settings_template import GivenSettings, settings_file
 from bms_estimator.settings.sources.fieldbus import CanSource, ModbusSource
-from bms_estimator.settings.sources.linux import BleSource, LinuxSource
 from bms_estimator.settings.sources.mqtt import MqttSource
+from bms_estimator.settings.sources.source import BleSource, LinuxSource
 
 SourceSettings = Annotated[MqttSource | LinuxSource | ModbusSource | CanSource | BleSource, Field(discriminator="kind")]
 

@@ -14,7 +14,7 @@ from bleak.exc import BleakError
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
-from bms_estimator.settings.sources.linux import BleSource
+from bms_estimator.settings.sources.source import BleSource
 from bms_estimator.sources.bluetooth.bms_sample import convert_sample
 from bms_estimator.sources.source import LineProducer, SourceUnavailableError
 

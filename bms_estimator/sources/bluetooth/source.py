@@ -4,7 +4,7 @@ import sys
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sources.linux import BleSource
+from bms_estimator.settings.sources.source import BleSource
 from bms_estimator.sources.source import LineProducer
 
 MIN_PYTHON_HEX = 0x030C0000

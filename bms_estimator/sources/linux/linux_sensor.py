@@ -16,7 +16,7 @@ from bms_estimator.model.decimal_text import number
 from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.protocols.base.reading import CONNECTED, sample_json_line
 from bms_estimator.settings.pack import Settings
-from bms_estimator.settings.sources.linux import LinuxSource
+from bms_estimator.settings.sources.source import LinuxSource
 from bms_estimator.sources.source import SILENT_PERIODS, LineProducer, SourceUnavailableError
 
 SYS = Path("/sys")

@@ -11,7 +11,7 @@ import pytest
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.reading import CONNECTED
-from bms_estimator.settings.sources.linux import BleSource
+from bms_estimator.settings.sources.source import BleSource
 from bms_estimator.sources.source import LineProducer, SourceUnavailableError
 from tests.patience import LONG_S
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from bms_estimator.protocols.base.reading import CONNECTED, Reading, read_line
-from bms_estimator.settings.sources.linux import LinuxSource
+from bms_estimator.settings.sources.source import LinuxSource
 from bms_estimator.sources.linux.linux_sensor import LinuxSensor
 from bms_estimator.sources.source import SourceUnavailableError
 from tests.patience import LONG_S
