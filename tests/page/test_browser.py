@@ -336,6 +336,7 @@ async def test_page_of_the_service_and_dashboard_show_equal_values_and_load_noth
 ) -> None:
     parameters = await programs.live.wait_json("bms/attic/parameters")
     await programs.live.publish("bms/attic/request/set_soc", b'{"soc": 0.66}')
+    await programs.live.wait_json("bms/attic/response/set_soc", lambda response: response["status"] == "ok")
     await programs.live.wait_json("bms/attic/state", lambda s: s["soc_known"])  # the pages show no unknown SOC
     async with tab(browser, programs.service.url) as own, dashboard_of(browser, programs, "attic") as other:
         for page_tab in (own, other):

@@ -121,6 +121,9 @@ async def connect(
         )
     except ValueError as error:
         raise UserError(f"--server {servers}: {error}") from error
+    except asyncio.CancelledError:
+        await close(nc)  # the library leaves the socket open
+        raise
     return nc
 
 

@@ -89,18 +89,18 @@ class TimedBoard(VirtualBoard):
     """Board that measures a pack under current pulses, and records when it sends.
 
     Attributes:
-        sent_s: Monotonic time of each frame so far, just before its bytes are written [s].
+        sent_s: Monotonic time just before the bytes of each sent frame are written [s], by the number of its sample.
     """
 
     def __init__(self, rate_hz: int) -> None:
         block = pulses(MAX_S * rate_hz, rate_hz)
         readings = [Reading(*row) for row in zip(block["current_a"], block["voltage_v"], strict=True)]
         super().__init__(readings, rate_hz=rate_hz)
-        self.sent_s: list[float] = []
+        self.sent_s: dict[int, float] = {}
 
     def _frame_with_fault(self, message: SampleMessage) -> bytes:
         frame = super()._frame_with_fault(message)
-        self.sent_s.append(time.monotonic())
+        self.sent_s[self.samples - 1] = time.monotonic()
         return frame
 
 
@@ -192,9 +192,8 @@ async def _measure(folder: Path, board: TimedBoard, rate_hz: int, server: Broker
             service.send_signal(signal.SIGINT)
             await asyncio.wait_for(service.wait(), PATIENCE_S)
             listening.cancel()
-    # The index of a frame of the board follows from the time of its sample, because a frame has one sample.
-    frames = np.rint(np.array([s.board_time_s for s in published]) * rate_hz).astype(int)
-    latency_s = np.array([s.arrival_s for s in published]) - np.array(board.sent_s)[frames]
+    # The board sends no frame of a sample while its buffer is full, before the service reads the line.
+    latency_s = np.array([s.arrival_s - board.sent_s[round(s.board_time_s * rate_hz)] for s in published])
     return Run(states[0].arrival_s - started_s, cpu, latency_s, len(board.sent_s), states[-1])
 
 

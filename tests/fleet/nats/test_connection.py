@@ -11,6 +11,7 @@ import pytest
 from bms_estimator.fleet.nats import connection
 from bms_estimator.fleet.nats.connection import close, connect
 from bms_estimator.fleet.server.nats_config import Tls
+from bms_estimator.process.tasks import end
 from tests.fleet.nats_cluster import running
 from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
@@ -93,6 +94,23 @@ async def test_client_with_unsent_messages_can_be_closed_after_the_server_was_ki
         await nc.publish("a.b", b"c")
         await close(nc)
         assert nc.is_closed
+
+
+async def test_cancelled_connecting_closes_the_socket() -> None:
+    accepted, closed = asyncio.Event(), asyncio.Event()
+
+    async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        accepted.set()  # without the server's greeting, for which the client waits
+        await reader.read()
+        closed.set()
+        writer.close()
+
+    async with await asyncio.start_server(accept, "127.0.0.1", 0) as server:
+        connecting = asyncio.create_task(connect(f"nats://127.0.0.1:{server.sockets[0].getsockname()[1]}", "x"))
+        await accepted.wait()
+        async with asyncio.timeout(LONG_S):
+            await end(connecting)
+            await closed.wait()
 
 
 async def _publish(nc, total_bytes: int) -> None:
