@@ -50,6 +50,7 @@ class BlockResult(NamedTuple):
         hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
             drops repeated rows.
         history: Messages of the pack's history.
+        is_deferred: True if the message was not processed, and stays in the stream until its pack is served.
         failed: Number of blocks that were skipped because of an internal error.
         dead_reason: Reason why the block becomes a dead letter; empty if it does not become one.
     """
@@ -62,6 +63,7 @@ class BlockResult(NamedTuple):
     alarms: tuple[AlarmMessage, ...] = ()
     hours: tuple[tuple[str, bytes], ...] = ()
     history: tuple[QueuedMessage, ...] = ()
+    is_deferred: bool = False
     failed: int = 0
     dead_reason: str = ""
 

@@ -192,7 +192,7 @@ class Partition:
             self._counters["deferred"] += 1
         else:
             self._counters["not_deferred"] += 1
-        return BlockResult(pack)
+        return BlockResult(pack, is_deferred=True)
 
     def process_deferred(
         self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
@@ -200,7 +200,7 @@ class Partition:
         """Process the next deferred message of a known pack. ``process`` describes the arguments."""
         pack_type = self.in_force.look_up(pack)
         if pack_type is None or pack not in self.deferred:
-            return BlockResult(pack)
+            return BlockResult(pack, is_deferred=True)
         self.deferred.advance(pack, sequence)
         if is_change(data):
             return self._apply_change(pack, data)

@@ -134,7 +134,7 @@ def test_changed_cell_discards_the_fit_and_its_history(samples) -> None:
     assert stream.partition.counters["fits"]
     other = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"capacity_ah": 3.3})})
     stream.partition.in_force._table = lambda _: (SETTINGS, other)
-    stream.partition.in_force.forget_type(PACK)
+    stream.partition.in_force.on_table_changed(PACK)
     stream.send_all(blocks[400:401])
     record = stream.partition.state(PACK)
     assert record["fit"]["in_force"]["sequence"] == 0
