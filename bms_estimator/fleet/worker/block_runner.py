@@ -6,7 +6,9 @@ is found and skipped (``takeover``).
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
 
 import structlog
 
@@ -29,19 +31,37 @@ MAX_PACKS = 10_000
 """Number of stored bucket levels above which levels of 0 are removed: those packs are idle."""
 
 
+@dataclass
+class Totals:
+    """Totals of a worker since its start, over its present and former partitions.
+
+    Attributes:
+        blocks, samples: Number of processed blocks and samples.
+        faults: Number of blocks skipped because of an internal error.
+        dead_letters: Number of dead letters.
+        estimation_s: Processor time of the estimation [s].
+        lag_s: Largest lag since it was last reset to None [s].
+        events: Events in the former partitions by name.
+    """
+
+    blocks: int = 0
+    samples: int = 0
+    faults: int = 0
+    dead_letters: int = 0
+    estimation_s: float = 0.0
+    lag_s: float | None = None
+    events: Counter[str] = field(default_factory=Counter)
+
+
 class CpuBudget:
     """Processor-time budget: a leaky bucket for each pack.
 
     Args:
         clock: Monotonic clock [s].
-
-    Attributes:
-        total_s: Processor time of all packs [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self.total_s = 0.0
         # level of each pack's bucket [s], and the time at which the level was computed [s]
         self._levels: dict[str, tuple[float, float]] = {}
 
@@ -51,7 +71,6 @@ class CpuBudget:
 
     def charge(self, pack: str, cpu_s: float) -> None:
         """Count processor time that a pack has used [s]."""
-        self.total_s += cpu_s
         self._levels[pack] = self._level_s(pack) + min(cpu_s, MAX_CHARGE_S), self._clock()
         if len(self._levels) > MAX_PACKS:
             self._levels = {name: level for name, level in self._levels.items() if self._level_s(name)}
@@ -74,14 +93,11 @@ class BlockRunner:
         step_lock: Lock of the worker (``BlockLoop``), held while a block is processed.
         guard: Guard against blocks that kill workers.
         results: Publisher of the results.
+        totals: Totals of the worker; updated.
         save: Writes a checkpoint.
 
     Attributes:
         budget: Processor time of each pack.
-        blocks, samples: Number of processed blocks and samples.
-        faults: Number of blocks skipped because of an internal error.
-        dead_letters: Number of dead letters.
-        lag_s: Largest lag since it was last reset to None [s].
     """
 
     def __init__(
@@ -92,14 +108,13 @@ class BlockRunner:
         step_lock: asyncio.Lock,
         guard: ReplayGuard,
         results: ResultPublisher,
+        totals: Totals,
         *,
         save: Callable[[], Awaitable[None]],
     ) -> None:
         self._number, self._partitions, self._worker, self._step_lock = number, partitions, worker, step_lock
-        self._guard, self._results, self._save = guard, results, save
+        self._guard, self._results, self._totals, self._save = guard, results, totals, save
         self.budget = CpuBudget()
-        self.blocks = self.samples = self.faults = self.dead_letters = 0
-        self.lag_s: float | None = None
 
     async def process(self, partition: Partition, message: RawMessage) -> BlockResult:
         """Process a message, or defer it if its pack has exhausted its budget or has deferred messages.
@@ -160,11 +175,14 @@ class BlockRunner:
         except Exception:  # otherwise the message would end each worker that takes over the partition
             log.exception("a block is skipped", partition=self._number, pack=pack, sequence=sequence)
             result = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR)
-        self.budget.charge(pack, time.thread_time() - begin_s)
-        self.faults += result.failed
+        cpu_s = time.thread_time() - begin_s
+        self.budget.charge(pack, cpu_s)
+        self._totals.estimation_s += cpu_s
+        self._totals.faults += result.failed
         self._results.queue(result)
         if result.dead_reason:
-            self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
+            self._totals.dead_letters += 1
+            self._results.queue_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
         if not result.is_deferred and is_block(data):
             self._count_block(data)
         return result
@@ -172,10 +190,6 @@ class BlockRunner:
     def _count_block(self, data: bytes) -> None:
         """Count a block and its samples, and update the lag."""
         samples, arrival_s = peek_header(data)
-        self.blocks += 1
-        self.samples += samples
-        self.lag_s = max(self.lag_s or 0.0, time.time() - arrival_s)
-
-    def _add_dead_letter(self, letter: DeadLetter) -> None:
-        self.dead_letters += 1
-        self._results.queue_dead_letter(letter)
+        self._totals.blocks += 1
+        self._totals.samples += samples
+        self._totals.lag_s = max(self._totals.lag_s or 0.0, time.time() - arrival_s)

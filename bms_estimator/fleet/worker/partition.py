@@ -58,6 +58,7 @@ class Partition:
         sequence: Stream sequence number of the last processed or deferred message; 0: none.
         in_force: Table of packs that is in force at this position of the stream.
         deferred: Queue of packs with deferred messages.
+        events: Numbers of blocks, samples and events in this process by name.
         clock_errors: Errors of edges' clocks beyond the limits of ``block_order``, by pack [s], positive if ahead. A pack is
             listed from a block with an error until the end of this hour on its clock.
     """
@@ -71,9 +72,10 @@ class Partition:
         wall: Callable[[], float] = time.time,
     ) -> None:
         self.number, self.sequence = number, 0
-        self._counters: Counter[str] = Counter()
-        self._records = PackRecords(self._counters)
-        self._processor = BlockProcessor(self._records.unpacked, self._counters, wall)
+        self._former_events: Mapping[str, int] = {}  # in the processes before
+        self.events = Counter[str]()
+        self._records = PackRecords(self.events)
+        self._processor = BlockProcessor(self._records.unpacked, self.events, wall)
         self.in_force = TableInForce(table, sources, self._processor.types)
         self.deferred = Deferred()
         self.clock_errors: dict[str, float] = {}
@@ -102,7 +104,7 @@ class Partition:
         partition = cls(number, table, sources=sources, wall=wall)
         partition.in_force.restore(checkpoint.in_force)
         partition.sequence = checkpoint.sequence
-        partition._counters.update(checkpoint.counters)
+        partition._former_events = checkpoint.counters
         partition._records.restore(checkpoint.packs, checkpoint.other_layouts)
         partition.deferred = Deferred(checkpoint.deferred)
         return partition
@@ -113,7 +115,7 @@ class Partition:
         return PartitionCheckpoint(
             number=self.number,
             sequence=self.sequence,
-            counters=dict(self._counters),
+            counters=self._all_events(),
             packs=packs,
             other_layouts=other_layouts,
             deferred=self.deferred.spans(),
@@ -133,10 +135,13 @@ class Partition:
     def counters(self) -> Mapping[str, int]:
         """Counters since the creation of the partition, including those of former workers."""
         return {
-            **self._counters,
+            **self._all_events(),
             "packs": len(self._records),
             "unknown": len(self.unknown),
         }
+
+    def _all_events(self) -> dict[str, int]:
+        return dict(Counter(self._former_events) + self.events)
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -171,7 +176,7 @@ class Partition:
             is_lethal: Skip the block, because it has killed workers (``takeover``).
         """
         if sequence <= self.sequence:
-            self._counters["repeated"] += 1
+            self.events["repeated"] += 1
             return BlockResult(pack)
         if pack in self.deferred:
             return self.defer(pack, sequence)
@@ -189,9 +194,9 @@ class Partition:
         self.sequence = max(self.sequence, sequence)
         if pack in self.deferred or len(self.deferred) < MAX_DEFERRED_PACKS or self.in_force.is_known(pack):
             self.deferred.add(pack, sequence)
-            self._counters["deferred"] += 1
+            self.events["deferred"] += 1
         else:
-            self._counters["not_deferred"] += 1
+            self.events["not_deferred"] += 1
         return BlockResult(pack, is_deferred=True)
 
     def process_deferred(
@@ -210,7 +215,7 @@ class Partition:
         """Skip and count a message of a pack that belongs to another partition."""
         if sequence > self.sequence:
             self.sequence = sequence
-            self._counters["misplaced"] += 1
+            self.events["misplaced"] += 1
             self._log_rejection(pack, "the pack belongs to another partition")
         return BlockResult(pack)
 
@@ -219,9 +224,9 @@ class Partition:
         try:
             self.in_force.apply_change(pack, data)
         except ValueError:
-            self._counters["damaged"] += 1
+            self.events["damaged"] += 1
         else:
-            self._counters["table_changes"] += 1
+            self.events["table_changes"] += 1
         return BlockResult(pack)
 
     def _receive_fit(self, pack: str, data: bytes, sequence: int, pack_type: PackType) -> BlockResult:
@@ -230,14 +235,14 @@ class Partition:
         try:
             result = decode_result(data)
         except ValueError:
-            self._counters["damaged"] += 1
+            self.events["damaged"] += 1
             return BlockResult(pack)
         if records.is_current(pack) and records.load(pack) is None:
             if self._processor.receive_fit(result, sequence, pack_type):
                 self._unsaved.add(pack, position(records.unpacked.delivery))
                 records.store(pack)
             else:
-                self._counters["stale_fits"] += 1
+                self.events["stale_fits"] += 1
         return BlockResult(pack)
 
     def _process_fit_or_block(
@@ -257,7 +262,7 @@ class Partition:
         try:
             return decode_block(data)
         except BlockError as error:
-            self._counters["damaged"] += 1
+            self.events["damaged"] += 1
             return error
 
     def _process_block(self, pack: str, block: BlockHeader, arrival: Arrival, pack_type: PackType) -> BlockResult:
@@ -275,9 +280,9 @@ class Partition:
             result = self._process_next(pack, block, arrival, pack_type, unmigrated_fields, newly_lost)
         else:
             result = BlockResult(pack)
-            self._counters[order.value] += 1
+            self.events[order.value] += 1
         if order is BlockOrder.NEXT or unmigrated_fields is None:
-            self._counters["lost_blocks"] += newly_lost
+            self.events["lost_blocks"] += newly_lost
             records.store(pack)
         else:
             records.store_unmigrated_delivery(pack)
@@ -323,7 +328,7 @@ class Partition:
             records.load_unmigrated_delivery(pack)
             classify_block(delivery, block)
             records.unpacked.count_lost(newly_lost)
-            self._counters[skip_counter] += 1
+            self.events[skip_counter] += 1
         mark_processed(delivery)
         self._update_clock_error(pack, float(delivery["clock_error_s"]))
         return result

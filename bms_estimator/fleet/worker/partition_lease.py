@@ -11,7 +11,7 @@ block loop continues.
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from contextlib import aclosing
 from functools import partial
 
@@ -24,7 +24,7 @@ from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.worker.block_loop import SILENCE_S, BlockLoop, DeliveredMessages
 from bms_estimator.fleet.worker.block_result import BlockResult, ResultPublisher, merge
-from bms_estimator.fleet.worker.block_runner import BlockRunner
+from bms_estimator.fleet.worker.block_runner import BlockRunner, Totals
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
@@ -58,11 +58,11 @@ class PartitionLease:
         is_busy: Returns True while any partition of the worker has received messages that are not processed.
 
     Attributes:
+        totals: Totals of the worker; updated.
         consumer: Consumer of the messages.
         results: Publisher of the results.
-        runner: Runner of the messages, with the counters of this lease.
+        runner: Runner of the messages.
         partition: State of the packs; None while the partition is not taken over.
-        restored_counters: Counters of the partition at its claim.
         claim: Claim of this worker; None while it has none.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
@@ -78,6 +78,7 @@ class PartitionLease:
         checkpoints: CheckpointStore,
         inbox: str,
         block_loop: BlockLoop,
+        totals: Totals,
         *,
         partitions: int,
         checkpoint_format: Callable[[], int],
@@ -86,6 +87,7 @@ class PartitionLease:
     ) -> None:
         self.number, self._table, self._sources = number, table, sources
         self._checkpoints, self._checkpoint_format, self._block_loop = checkpoints, checkpoint_format, block_loop
+        self.totals = totals
         self._js, self._messages, self._is_busy = nc.jetstream(), RawMessages(nc, number), is_busy
         self._guard = ReplayGuard(checkpoints.replays, number)
         self.results = ResultPublisher(nc)
@@ -96,11 +98,11 @@ class PartitionLease:
             block_loop.step_lock,
             self._guard,
             self.results,
+            totals,
             save=self.save,
         )
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
-        self.restored_counters: Mapping[str, int] = {}
         self.claim: Claim | None = None
         self.trouble, self.checkpoint_due_s = "", 0.0
         self.refused_format: int | None = None
@@ -226,6 +228,12 @@ class PartitionLease:
                 reason=error_text(error),
             )
 
+    def drop(self) -> None:
+        """Drop state and claim, and add the events in the partition to the totals of the worker."""
+        if self.partition:
+            self.totals.events.update(self.partition.events)
+        self.partition = self.claim = None
+
     def on_settings_changed(self, pack: str) -> None:
         """Handle a changed or new row of the table of packs."""
         if self.partition:
@@ -274,7 +282,7 @@ class PartitionLease:
             partition = await restore_partition(self._checkpoints, claim, self.number, self._table, self._sources)
             self._replay_end = await self._messages.last_sequence()
             await self._guard.begin(claim, self._replay_end)
-            self.partition, self.claim, self.restored_counters = partition, claim, partition.counters
+            self.partition, self.claim = partition, claim
         last_sequence = await self._messages.last_of_all_partitions()
         if self._guard.end_sequence > last_sequence:  # the server has since lost the replayed stream
             self._guard.end_sequence = 0
@@ -364,7 +372,7 @@ class PartitionLease:
     def _drop_ownership(self, error: Exception) -> None:
         """Drop state and claim, because another worker has claimed the partition."""
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
-        self.partition = self.claim = None
+        self.drop()
         self._delivered.reset()
         self.results.clear()  # the owner of the partition computes them from the last checkpoint on
 
