@@ -20,7 +20,8 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
-from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
+from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints

@@ -160,7 +160,8 @@ async def fetch_registry(nc: "Client") -> PackRegistry:
 
 
 async def _load(nc: "Client", path: Path, table: PackTable, files: dict[str, str], *, remove: bool) -> str:
-    from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket  # noqa: PLC0415
+    from bms_estimator.fleet.nats.bucket_reader import read_bucket  # noqa: PLC0415
+    from bms_estimator.fleet.packs.pack_bucket import write_bucket  # noqa: PLC0415
 
     stored_cells = {name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()}
     check_models(path, table, stored_cells | files)
@@ -227,7 +228,8 @@ def _print_erasures(erasures: "dict[str, Erasure]") -> None:
 
 
 async def _remove(nc: "Client", packs: set[str]) -> None:
-    from bms_estimator.fleet.packs.pack_bucket import read_bucket, remove_keys  # noqa: PLC0415
+    from bms_estimator.fleet.nats.bucket_reader import read_bucket  # noqa: PLC0415
+    from bms_estimator.fleet.packs.pack_bucket import remove_keys  # noqa: PLC0415
 
     reject_unknown(packs, await read_bucket(nc, PACKS_BUCKET))
     await remove_keys(nc, PACKS_BUCKET, packs)

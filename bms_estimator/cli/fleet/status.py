@@ -127,6 +127,7 @@ async def _stream_lines(nc: "Client") -> list[str]:
     from nats.errors import Error as NatsError  # noqa: PLC0415 - NATS is optional
 
     from bms_estimator.fleet.nats.dead_packs import DeadPackReader  # noqa: PLC0415
+    from bms_estimator.fleet.nats.stream_reader import StreamError  # noqa: PLC0415
     from bms_estimator.fleet.nats.streams import partitions_of  # noqa: PLC0415
     from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks  # noqa: PLC0415
 
@@ -137,7 +138,7 @@ async def _stream_lines(nc: "Client") -> list[str]:
                 return ["the server has no streams yet: was `fleet serve` started?"]
             warning = (await unsaved_blocks(nc, range(partitions))).warning
             return [*_dead_letters(await DeadPackReader(nc).read()), *([warning] if warning else [])]
-    except (TimeoutError, NatsError, UserError) as error:
+    except (TimeoutError, NatsError, StreamError, UserError) as error:
         hint = "in a cluster, are most nodes up? Is or was the disk full? Then free space and restart `fleet serve`"
         return [f"the streams cannot be read ({str(error) or 'no answer'}): {hint}"]
 

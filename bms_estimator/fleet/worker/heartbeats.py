@@ -162,8 +162,7 @@ class Membership:
     def __init__(self, me: str) -> None:
         self.me = me
         self.refused: dict[int, int] = {}
-        self._last_heartbeat_s: dict[str, float] = {}
-        self._last_heartbeat: dict[str, Heartbeat] = {}
+        self._last: dict[str, tuple[float, Heartbeat]] = {}  # arrival and heartbeat of each other worker
         self._alive: dict[str, frozenset[int]] = {}
         self._share: set[int] = set()
 
@@ -173,15 +172,15 @@ class Membership:
         if worker == self.me:
             return False
         if heartbeat.leaving:
-            self._last_heartbeat_s.pop(worker, None)
+            self._last.pop(worker, None)
             return False
-        is_new = worker not in self._last_heartbeat_s
-        self._last_heartbeat_s[worker], self._last_heartbeat[worker] = now_s, heartbeat
+        is_new = worker not in self._last
+        self._last[worker] = now_s, heartbeat
         return is_new
 
     def extend_deadlines(self, now_s: float) -> None:
         """Extend the deadline of all workers after a time without a connection, in which no heartbeat could arrive."""
-        self._last_heartbeat_s = dict.fromkeys(self._last_heartbeat_s, now_s)
+        self._last = {worker: (now_s, heartbeat) for worker, (_, heartbeat) in self._last.items()}
 
     def checkpoint_format(self, now_s: float) -> int:
         """Return the format in which checkpoints are written, so that all live workers can read them."""
@@ -206,8 +205,5 @@ class Membership:
 
     def _others(self, now_s: float) -> dict[str, Heartbeat]:
         """Return the last heartbeat of each other live worker."""
-        self._last_heartbeat_s = {
-            worker: last_s for worker, last_s in self._last_heartbeat_s.items() if now_s - last_s < DEAD_S
-        }
-        self._last_heartbeat = {worker: self._last_heartbeat[worker] for worker in self._last_heartbeat_s}
-        return self._last_heartbeat
+        self._last = {worker: last for worker, last in self._last.items() if now_s - last[0] < DEAD_S}
+        return {worker: heartbeat for worker, (_, heartbeat) in self._last.items()}

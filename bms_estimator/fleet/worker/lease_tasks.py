@@ -120,7 +120,7 @@ class PeriodicStorage:
     async def send_results(self, leases: Sequence[PartitionLease]) -> None:
         """Send the queued summaries and dead letters again."""
         for lease in leases:
-            if lease.results.is_waiting and self._nc.is_connected:
+            if lease.results.waiting and self._nc.is_connected:
                 await self._try(lease, lease.results.send_queued)
 
     async def _try(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:

@@ -58,7 +58,7 @@ class FittedStream(Stream):
         self.hours += [Hour.model_validate_json(row) for _, row in result.hours]
         for message in result.history:
             if message.subject == subjects.history(pack):
-                self.history.setdefault(message.message_id, message.data)  # the server drops repetitions
+                self.history.setdefault(message.headers["Nats-Msg-Id"], message.data)  # the server drops repetitions
             else:
                 self.requests.append(FitRequest.model_validate_json(message.data))
         return result

@@ -18,11 +18,12 @@ import nats.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, CheckpointPointer, pointer_key
 from bms_estimator.fleet.nats.connection import RETRY_S
 from bms_estimator.fleet.nats.message_erasure import erase_messages
 from bms_estimator.fleet.nats.streams import PRIORITY_GROUP, RESPONSE_TIMEOUT_S, consumer, require_partitions
-from bms_estimator.fleet.packs.pack_bucket import POLL_S, purge_keys, read_bucket, remove_keys
+from bms_estimator.fleet.packs.pack_bucket import POLL_S, purge_keys, remove_keys
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
     PartitionCheckpoint,
