@@ -157,10 +157,10 @@ class Partition:
 
     def cells(self, pack: str) -> NDArray[np.void]:
         """Return a copy of the states of a pack's single cells, shape (m,), dtype ``CELL``; m is 0 without any."""
-        if not self._records.has_cells(pack):
+        if not self._records.is_current(pack):
             return np.zeros(0, CELL)
         self._records.load(pack)
-        return self._records.unpacked.cells.copy()
+        return self._records.unpacked.cells.copy() if self._records.unpacked.cell_count else np.zeros(0, CELL)
 
     def process(
         self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
