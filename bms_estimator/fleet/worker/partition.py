@@ -141,7 +141,8 @@ class Partition:
         }
 
     def _all_events(self) -> dict[str, int]:
-        return dict(Counter(self._former_events) + self.events)
+        former = self._former_events
+        return {**former, **{name: former.get(name, 0) + count for name, count in self.events.items()}}
 
     @property
     def unknown(self) -> tuple[str, ...]:
