@@ -110,9 +110,6 @@ STATUS_HEADER = "Status"
 """Header of a response without a message."""
 WRONG_PIN = "423"
 """Status of a request with an expired pin."""
-EXPECTED_STATUSES = frozenset({"404", "408", "409"})
-"""Statuses of a request that ended without messages, by its expiry or by a change of the consumer's leader. They need no
-action, because the next request follows."""
 
 
 class DeliveredMessage(NamedTuple):
@@ -135,7 +132,6 @@ class PinnedConsumer:
 
     Attributes:
         waiting: Queued messages.
-        trouble: Error of the last request; empty without one.
     """
 
     def __init__(self, nc: Client, partition: int, inbox: str) -> None:
@@ -144,7 +140,6 @@ class PinnedConsumer:
         self._info_subject = f"$JS.API.CONSUMER.INFO.{subjects.RAW_STREAM}.{consumer(partition)}"
         self._unpin_subject = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
         self.waiting: deque[DeliveredMessage] = deque()
-        self.trouble = ""
         self._pin = ""
         self._pin_count = 0
         self._last_consumer_sequence = -1  # of the last message; initially a value that no message follows
@@ -193,13 +188,9 @@ class PinnedConsumer:
         if status is None:
             self._queue_message(message, headers.get(PIN_HEADER, ""))
             return False
-        if status != WRONG_PIN:
-            self.trouble = (
-                "" if status in EXPECTED_STATUSES else f"status {status} {headers.get('Description', '')}".strip()
-            )
-            return False
-        # a status may still answer a request under an earlier pin
-        is_pin_lost = self.has_pin and message.subject.rpartition(".")[2] == str(self._pin_count)
+        # after any other status the next request follows; a status may still answer a request under an earlier pin
+        is_of_present_pin = self.has_pin and message.subject.rpartition(".")[2] == str(self._pin_count)
+        is_pin_lost = status == WRONG_PIN and is_of_present_pin
         if is_pin_lost:
             self._pin = ""
             self.waiting.clear()  # the server delivers them again to the next pinned worker
@@ -223,7 +214,6 @@ class PinnedConsumer:
         position = parse_position(message.reply)
         if pin != self._pin:
             self._pin, self._pin_count = pin, self._pin_count + 1
-        self.trouble = ""
         follows = position.consumer_sequence == self._last_consumer_sequence + 1
         self._last_consumer_sequence = position.consumer_sequence
         raw = raw_message(message.subject, message.data, position.stream_sequence, position.received_s)
