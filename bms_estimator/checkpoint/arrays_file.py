@@ -90,15 +90,20 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
         return dict(file)
 
 
+def to_bytes(arrays: Mapping[str, Any]) -> bytes:
+    """Encode arrays and scalars by name."""
+    packed = io.BytesIO()
+    np.savez_compressed(packed, **arrays)
+    return packed.getvalue()
+
+
 def write_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays atomically to a file.
 
     Raises:
         OSError: The file cannot be written.
     """
-    packed = io.BytesIO()
-    np.savez_compressed(packed, **arrays)
-    write_private(path, packed.getbuffer())
+    write_private(path, to_bytes(arrays))
 
 
 def set_aside(path: Path, target: Path) -> str:

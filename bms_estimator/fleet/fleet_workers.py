@@ -116,10 +116,7 @@ def _max_lag_s(received: deque[_Received]) -> float | None:
 def _worker_overview(received: deque[_Received], now_s: float, alive: bool) -> dict[str, Any]:
     first, last = received[0], received[-1]
     heartbeat, span_s = last.heartbeat, last.at_s - first.at_s
-
-    def rate(last_value: float, first_value: float) -> float | None:
-        return (last_value - first_value) / span_s if span_s > 0.0 and alive else None
-
+    rate = (heartbeat.samples - first.heartbeat.samples) / span_s if span_s > 0.0 and alive else None
     return {
         "id": heartbeat.id,
         "alive": alive,
@@ -128,13 +125,9 @@ def _worker_overview(received: deque[_Received], now_s: float, alive: bool) -> d
         "partitions": len(heartbeat.partitions),
         "packs": heartbeat.packs,
         "lag_s": _max_lag_s(received),
-        "blocks_per_s": rate(heartbeat.blocks, first.heartbeat.blocks),
-        "samples_per_s": rate(heartbeat.samples, first.heartbeat.samples),
+        "samples_per_s": rate,
         "waiting": heartbeat.waiting,
-        "rss_mib": heartbeat.rss_mib,
-        "cpu": rate(heartbeat.cpu_s, first.heartbeat.cpu_s),
         "trouble": heartbeat.trouble,
-        "version": heartbeat.version,
         "checkpoint_formats": [heartbeat.oldest_checkpoint_format, heartbeat.checkpoint_format],
         "refused": [[each.partition, each.format] for each in heartbeat.refused],
     }

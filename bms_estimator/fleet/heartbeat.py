@@ -70,8 +70,8 @@ class Heartbeat(BaseModel):
     waiting: int = 0
     """Number of messages that were received from the server and not processed yet."""
     hours_waiting: int = 0
-    """Number of messages, not of hours: hourly summaries and messages of histories that the server has not acknowledged
-    yet."""
+    """Number of messages, not of hours: hourly summaries, messages of histories and dead letters that the server has not
+    acknowledged yet."""
     unsaved_s: float = 0.0
     """Largest time for which a partition has had blocks that its last checkpoint does not include [s]."""
     checkpoint_s: float | None = None

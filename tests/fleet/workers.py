@@ -20,7 +20,8 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.heartbeat import Heartbeat
-from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
+from bms_estimator.fleet.packs.pack_bucket import write_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.packs.pack_row import PackSpec, encode_row
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
@@ -37,27 +38,6 @@ STORE_ID_NS = 1_790_000_000 * 10**9
 """Creation time of the edges' stores [ns since 1970]."""
 SAMPLES = 60
 """Number of samples of a block, which lasts ten minutes."""
-OLD_HEARTBEAT = {
-    "id": "old",
-    "started_s": 1.79e9,
-    "leaving": False,
-    "partitions": [0, 1],
-    "packs": 7,
-    "blocks": 70,
-    "samples": 4200,
-    "faults": 0,
-    "lag_s": None,
-    "counters": {"packs": 7},
-    "unknown_count": 0,
-    "unknown": [],
-    "waiting": 0,
-    "hours_waiting": 0,
-    "checkpoint_age_s": 12.5,
-    "cpu_s": 3.0,
-    "rss_mib": 200.0,
-    "trouble": "",
-}
-"""Heartbeat of a version without formats, refusals, dead letters and clock errors."""
 
 
 def samples(pack: str, number: int) -> np.ndarray:

@@ -1,12 +1,11 @@
 """``bms-estimator fleet backup`` and ``fleet restore``: copy of a tenant's streams, and a new server from it."""
 
-import asyncio
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, on_server
 
 
 def backup(
@@ -26,7 +25,9 @@ def backup(
     The backup contains samples, hourly summaries, dead letters, the table of packs and the checkpoints. It does not
     contain batches that wait for `fleet ingest`.
     """
-    asyncio.run(_back_up((server, creds, ca), folder, include or []))
+    from bms_estimator.fleet.server.backup import back_up  # noqa: PLC0415 - NATS is optional
+
+    on_server((server, creds, ca), lambda nc: back_up(nc, folder, include or [], typer.echo))
 
 
 def restore(
@@ -39,20 +40,6 @@ def restore(
 
     The server must run and must not have any data of the tenant.
     """
-    asyncio.run(_restore((server, creds, ca), folder))
+    from bms_estimator.fleet.server.backup import restore as restore_streams  # noqa: PLC0415 - NATS is optional
 
-
-async def _back_up(address: ServerAddress, folder: Path, include: list[Path]) -> None:
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
-    from bms_estimator.fleet.server.backup import back_up  # noqa: PLC0415
-
-    async with connected(*address) as nc:
-        await back_up(nc, folder, include, typer.echo)
-
-
-async def _restore(address: ServerAddress, folder: Path) -> None:
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
-    from bms_estimator.fleet.server.backup import restore as restore_streams  # noqa: PLC0415
-
-    async with connected(*address) as nc:
-        await restore_streams(nc, folder, typer.echo)
+    on_server((server, creds, ca), lambda nc: restore_streams(nc, folder, typer.echo))

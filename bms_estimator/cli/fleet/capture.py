@@ -1,6 +1,5 @@
 """``bms-estimator fleet capture``: table of a pack's stored samples."""
 
-import asyncio
 import math
 from datetime import UTC, datetime
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, on_server
 from bms_estimator.cli.options.capture_options import Force, check_output_file
 from bms_estimator.cli.options.output import count_text
 from bms_estimator.model.clock import iso_utc
@@ -66,8 +65,10 @@ def capture(
     """
     check_output_file(out, [], force=force)
     sink = table_sink(out)
+    from bms_estimator.fleet.nats.block_capture import fetch  # noqa: PLC0415 - NATS is optional
+
     since_s, until_s = epoch_s(since, -math.inf), epoch_s(until, math.inf)
-    fetched = asyncio.run(fetch_blocks(pack, since_s, until_s, (server, creds, ca)))
+    fetched = on_server((server, creds, ca), lambda nc: fetch(nc, pack, since_s=since_s, until_s=until_s))
     if not fetched.blocks:
         raise UserError(no_samples_reason(pack, fetched))
     rows = 0
@@ -88,19 +89,6 @@ def capture(
 def epoch_s(time: datetime | None, default_s: float) -> float:
     """Convert a UTC time to seconds since 1970; return ``default_s`` for None."""
     return default_s if time is None else time.replace(tzinfo=UTC).timestamp()
-
-
-async def fetch_blocks(pack: str, since_s: float, until_s: float, address: ServerAddress) -> "BlockCapture":
-    """Return the blocks of a pack that the server still has.
-
-    Raises:
-        UserError: The server cannot be reached.
-    """
-    from bms_estimator.fleet.nats.block_capture import fetch  # noqa: PLC0415 - NATS is optional
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-
-    async with connected(*address) as nc:
-        return await fetch(nc, pack, since_s=since_s, until_s=until_s)
 
 
 def no_samples_reason(pack: str, fetched: "BlockCapture") -> str:

@@ -1,17 +1,16 @@
 """``bms-estimator fleet checkpoints``: stored states of the partitions."""
 
-import asyncio
 from collections import defaultdict
 from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, on_server
 from bms_estimator.cli.options.output import print_table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
     from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, CheckpointPointer
 
@@ -35,7 +34,9 @@ def list_checkpoints(
     ca: Ca = None,
 ) -> None:
     """Print the days with daily checkpoints and their number of partitions, or all checkpoints of one partition."""
-    pointers = asyncio.run(_read((server, creds, ca)))
+    from bms_estimator.fleet.worker.checkpoint.admin_changes import read_pointers  # noqa: PLC0415 - NATS is optional
+
+    pointers = on_server((server, creds, ca), read_pointers)
     if partition is None:
         columns, rows = DAY_COLUMNS, _day_rows(pointers.values())
     else:
@@ -63,7 +64,11 @@ def restore(
     The workers then process again the later blocks that are still in the stream. If wrong samples have spoiled the states, use
     --skip-blocks.
     """
-    chosen = asyncio.run(_restore((server, creds, ca), day.date(), frozenset(partition or ()), skip_blocks=skip_blocks))
+    from bms_estimator.fleet.worker.checkpoint.admin_changes import restore_day  # noqa: PLC0415 - NATS is optional
+
+    chosen = on_server(
+        (server, creds, ca), lambda nc: restore_day(nc, day.date(), partition or (), skip_blocks=skip_blocks)
+    )
     for number, info in sorted(chosen.items()):
         typer.echo(f"partition {number}: returned to the checkpoint of {_time(info)} UTC")
 
@@ -100,21 +105,3 @@ def _time(info: "CheckpointInfo") -> str:
 
 def _megabytes(size: int) -> str:
     return f"{size / 1e6:,.1f}"
-
-
-async def _read(address: ServerAddress) -> "dict[int, CheckpointPointer]":
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.worker.checkpoint.admin_changes import read_pointers  # noqa: PLC0415
-
-    async with connected(*address) as nc:
-        return await read_pointers(nc)
-
-
-async def _restore(
-    address: ServerAddress, day: date, partitions: frozenset[int], *, skip_blocks: bool
-) -> "Mapping[int, CheckpointInfo]":
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.worker.checkpoint.admin_changes import restore_day  # noqa: PLC0415
-
-    async with connected(*address) as nc:
-        return await restore_day(nc, day, partitions, skip_blocks=skip_blocks)

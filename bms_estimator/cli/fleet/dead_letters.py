@@ -1,15 +1,16 @@
 """``bms-estimator fleet dead-letters``: blocks that workers could not process."""
 
-import asyncio
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, on_server
 from bms_estimator.cli.options.output import count_text, print_table
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
+    from nats.aio.client import Client
+
     from bms_estimator.fleet.nats.dead_letters import DeadLetter
 
 COLUMNS = ("pack", "stored", "sequence", "bytes", "worker", "reason")
@@ -24,7 +25,9 @@ app = typer.Typer(
 @app.command("list")
 def list_letters(server: Server = DEFAULT_SERVER, creds: Creds = None, ca: Ca = None) -> None:
     """Print the stored dead letters with their reasons."""
-    letters = asyncio.run(_read((server, creds, ca)))
+    from bms_estimator.fleet.nats.dead_letters import read_dead_letters  # noqa: PLC0415 - NATS is optional
+
+    letters = on_server((server, creds, ca), read_dead_letters)
     print_table(COLUMNS, [_row(letter) for letter in letters])
     if not letters:
         typer.echo("none")
@@ -44,7 +47,7 @@ def replay(
     Workers process a block if its pack still awaits it. This is true for blocks of a version that the workers did not read before
     an upgrade. A block that killed workers was skipped, and is not processed later.
     """
-    count, names = asyncio.run(_replay((server, creds, ca), set(packs or ())))
+    count, names = on_server((server, creds, ca), lambda nc: _replay(nc, set(packs or ())))
     packs_text = f"{count_text(len(names), 'pack')}: {', '.join(sorted(names))}"
     typer.echo(f"replayed {count_text(count, 'block')} of {packs_text}" if count else "none")
 
@@ -54,24 +57,14 @@ def _row(letter: "DeadLetter") -> tuple[object, ...]:
     return letter.pack, stored, letter.sequence, len(letter.data), letter.worker, letter.reason
 
 
-async def _read(address: ServerAddress) -> "list[DeadLetter]":
-    from bms_estimator.fleet.nats.dead_letters import read_dead_letters  # noqa: PLC0415 - NATS is optional
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-
-    async with connected(*address) as nc:
-        return await read_dead_letters(nc)
-
-
-async def _replay(address: ServerAddress, packs: set[str]) -> tuple[int, set[str]]:
+async def _replay(nc: "Client", packs: set[str]) -> tuple[int, set[str]]:
     """Replay the dead letters of some packs, or of all. Return their number, and the names of their packs."""
     from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter  # noqa: PLC0415
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
 
-    async with connected(*address) as nc:
-        letters = await read_dead_letters(nc)
-        if missing := packs - {letter.pack for letter in letters}:
-            raise UserError(f"{', '.join(sorted(missing))}: no dead letters; `fleet dead-letters list` prints all")
-        chosen = [letter for letter in letters if not packs or letter.pack in packs]
-        for letter in chosen:
-            await replay_letter(nc, letter)
+    letters = await read_dead_letters(nc)
+    if missing := packs - {letter.pack for letter in letters}:
+        raise UserError(f"{', '.join(sorted(missing))}: no dead letters; `fleet dead-letters list` prints all")
+    chosen = [letter for letter in letters if not packs or letter.pack in packs]
+    for letter in chosen:
+        await replay_letter(nc, letter)
     return len(chosen), {letter.pack for letter in chosen}

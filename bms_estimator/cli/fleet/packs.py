@@ -1,6 +1,5 @@
 """``bms-estimator fleet packs``: table of packs and their cells."""
 
-import asyncio
 import sys
 from collections.abc import Collection, Container
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import tomlkit
 import typer
 
-from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress, on_server
 from bms_estimator.cli.options.output import count_text
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
 from bms_estimator.fleet.packs.csv_table import CELL_FILE_SUFFIX, PackTable, check_models, read_table, table_lines
@@ -19,6 +18,8 @@ from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
+    from nats.aio.client import Client
+
     from bms_estimator.fleet.worker.checkpoint.admin_changes import Erasure
 
 app = typer.Typer(
@@ -50,13 +51,13 @@ def load(
     """
     packs = read_table(table)
     files = {name: _read_text(path) for name, path in packs.cell_files.items()}
-    typer.echo(asyncio.run(_load(table, packs, files, (server, creds, ca), remove=remove)))
+    typer.echo(on_server((server, creds, ca), lambda nc: _load(nc, table, packs, files, remove=remove)))
 
 
 @app.command("list")
 def list_packs(server: Server = DEFAULT_SERVER, creds: Creds = None, ca: Ca = None) -> None:
     """Print the server's table of packs as CSV, which `load` can read; errors in rows are printed to stderr."""
-    registry = asyncio.run(fetch_registry((server, creds, ca)))
+    registry = on_server((server, creds, ca), fetch_registry)
     specs = {pack: spec for pack in sorted(registry) if isinstance(spec := registry.parsed_row(pack), PackSpec)}
     invalid_packs = [pack for pack in sorted(registry) if pack not in specs]
     # packs with equal models have equal errors, so that only the first pack of each model is checked
@@ -94,7 +95,7 @@ def remove(
         return
     if folder is not None:
         raise UserError("--folder: give it together with --erase")
-    asyncio.run(_remove(set(names), address))
+    on_server(address, lambda nc: _remove(nc, set(names)))
     typer.echo(f"removed from the table: {', '.join(names)}")
     typer.echo("their blocks, states and hourly summaries remain; --erase erases them")
 
@@ -111,7 +112,7 @@ def show(
     ] = None,
 ) -> None:
     """Print a pack's settings as a pack file; `replay --pack` with this file reproduces the workers' estimates."""
-    registry = asyncio.run(fetch_registry((server, creds, ca)))
+    registry = on_server((server, creds, ca), fetch_registry)
     reject_unknown([pack], registry)
     files = pack_files(pack, registry)
     if out is None:
@@ -149,29 +150,24 @@ def reject_unknown(packs: Collection[str], registry: Container[str]) -> None:
         raise UserError(f"{', '.join(unknown)}: not in the table of packs; `fleet packs list` prints it")
 
 
-async def fetch_registry(address: ServerAddress) -> PackRegistry:
+async def fetch_registry(nc: "Client") -> PackRegistry:
     """Return the server's table of packs and cells."""
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
-    from bms_estimator.fleet.packs.pack_bucket import PackBucket  # noqa: PLC0415
+    from bms_estimator.fleet.packs.pack_bucket import PackBucket  # noqa: PLC0415 - NATS is optional
 
-    async with connected(*address) as nc:
-        bucket = PackBucket(nc)
-        await bucket.refresh()
+    bucket = PackBucket(nc)
+    await bucket.refresh()
     return bucket.packs
 
 
-async def _load(path: Path, table: PackTable, files: dict[str, str], address: ServerAddress, *, remove: bool) -> str:
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.packs.pack_bucket import read_bucket, write_bucket  # noqa: PLC0415
+async def _load(nc: "Client", path: Path, table: PackTable, files: dict[str, str], *, remove: bool) -> str:
+    from bms_estimator.fleet.nats.bucket_reader import read_bucket  # noqa: PLC0415
+    from bms_estimator.fleet.packs.pack_bucket import write_bucket  # noqa: PLC0415
 
-    async with connected(*address) as nc:
-        stored_cells = {
-            name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()
-        }
-        check_models(path, table, stored_cells | files)
-        cells = await write_bucket(nc, CELLS_BUCKET, {name: text.encode() for name, text in files.items()})
-        rows = {name: line.data for name, line in table.packs.items()}
-        packs = await write_bucket(nc, PACKS_BUCKET, rows, remove=remove)
+    stored_cells = {name: data.decode(errors="replace") for name, data in (await read_bucket(nc, CELLS_BUCKET)).items()}
+    check_models(path, table, stored_cells | files)
+    cells = await write_bucket(nc, CELLS_BUCKET, {name: text.encode() for name, text in files.items()})
+    rows = {name: line.data for name, line in table.packs.items()}
+    packs = await write_bucket(nc, PACKS_BUCKET, rows, remove=remove)
     spec_count = len(set(rows.values()))
     counts = {
         "new": packs.new,
@@ -191,14 +187,18 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
     from bms_estimator.fleet.nats.stream_sizes import DAILY_CHECKPOINTS  # noqa: PLC0415
     from bms_estimator.fleet.queries.collector import only_collector  # noqa: PLC0415 - its packages are optional
     from bms_estimator.fleet.queries.row_erasure import erase_rows  # noqa: PLC0415
+    from bms_estimator.fleet.worker.checkpoint.admin_changes import erase_packs  # noqa: PLC0415
+
+    def erase_on_server() -> None:
+        _print_erasures(on_server(address, lambda nc: erase_packs(nc, set(packs))))
 
     if folder is None:
-        _print_erasures(asyncio.run(_erase_from_server(packs, address)))
+        erase_on_server()
     else:
         if not folder.is_dir():
             raise UserError(f"--folder {folder}: no such folder")
         with only_collector(folder):  # before anything is erased
-            _print_erasures(asyncio.run(_erase_from_server(packs, address)))
+            erase_on_server()
             try:
                 typer.echo(f"{folder}: {count_text(erase_rows(folder, packs), 'row')} erased")
             except OSError as error:
@@ -216,14 +216,6 @@ def _erase(packs: list[str], address: ServerAddress, folder: Path | None) -> Non
     typer.echo("\n  ".join(["remaining:", *remaining]))
 
 
-async def _erase_from_server(packs: list[str], address: ServerAddress) -> "dict[str, Erasure]":
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.worker.checkpoint.admin_changes import erase_packs  # noqa: PLC0415
-
-    async with connected(*address) as nc:
-        return await erase_packs(nc, set(packs))
-
-
 def _print_erasures(erasures: "dict[str, Erasure]") -> None:
     for pack, erasure in erasures.items():
         typer.echo(
@@ -235,13 +227,12 @@ def _print_erasures(erasures: "dict[str, Erasure]") -> None:
             typer.echo(f"{pack}: remaining messages in the stream {stream}: {count}")
 
 
-async def _remove(packs: set[str], address: ServerAddress) -> None:
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
-    from bms_estimator.fleet.packs.pack_bucket import read_bucket, remove_keys  # noqa: PLC0415
+async def _remove(nc: "Client", packs: set[str]) -> None:
+    from bms_estimator.fleet.nats.bucket_reader import read_bucket  # noqa: PLC0415
+    from bms_estimator.fleet.packs.pack_bucket import remove_keys  # noqa: PLC0415
 
-    async with connected(*address) as nc:
-        reject_unknown(packs, await read_bucket(nc, PACKS_BUCKET))
-        await remove_keys(nc, PACKS_BUCKET, packs)
+    reject_unknown(packs, await read_bucket(nc, PACKS_BUCKET))
+    await remove_keys(nc, PACKS_BUCKET, packs)
 
 
 def _read_text(path: Path) -> str:

@@ -39,23 +39,12 @@ def collect(
 
 
 async def _collect(address: ServerAddress, folder: Path, period_s: float) -> None:
-    from bms_estimator.fleet.nats.connection import close, connect  # noqa: PLC0415
+    from bms_estimator.fleet.nats.connection import run_connected  # noqa: PLC0415
     from bms_estimator.fleet.queries.collector import Collector  # noqa: PLC0415
-    from bms_estimator.process.runtime import end, stop_on_signal  # noqa: PLC0415
+    from bms_estimator.process.runtime import stop_on_signal  # noqa: PLC0415
 
-    server, creds, ca = address
     stop = stop_on_signal()
-    connecting = asyncio.ensure_future(connect(server, "collector", creds=creds, ca=ca))
-    stopping = asyncio.ensure_future(stop.wait())
-    await asyncio.wait((connecting, stopping), return_when=asyncio.FIRST_COMPLETED)
-    if not connecting.done():  # stopped before a server was found
-        await end(connecting)
-        return
-    nc = connecting.result()
-    try:
-        await Collector(nc, folder, period_s=period_s).run(stop)
-    finally:
-        await close(nc)
+    await run_connected(lambda nc: Collector(nc, folder, period_s=period_s).run(stop), stop, "collector", address)
 
 
 def repair(

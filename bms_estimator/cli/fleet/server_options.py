@@ -1,9 +1,17 @@
-"""Options of all fleet commands: address of the server, and credentials."""
+"""Options of all fleet commands: address of the server, and credentials; and requests of a command that ends after them."""
 
+import asyncio
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from nats.aio.client import Client
+
+T = TypeVar("T")
 
 DEFAULT_SERVER = "nats://127.0.0.1:4222"
 """Default address of the server."""
@@ -26,3 +34,18 @@ Ca = Annotated[
 ]
 ServerAddress = tuple[str, Path | None, Path | None]
 """URLs of the server, credentials file, and certificate authority."""
+
+
+def on_server(address: ServerAddress, action: "Callable[[Client], Awaitable[T]]") -> T:
+    """Run an action with a connection to the server, and return its result.
+
+    Raises:
+        UserError: The server does not respond, rejects the client, or rejects a request of the action.
+    """
+    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415 - NATS is optional
+
+    async def run() -> T:
+        async with connected(*address) as nc:
+            return await action(nc)
+
+    return asyncio.run(run())

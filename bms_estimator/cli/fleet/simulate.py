@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
 from bms_estimator.cli.options.pack_options import decimal, whole
 from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
@@ -16,13 +16,13 @@ from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.model.config_file import without_secrets, write_text
 from bms_estimator.model.errors import UserError
-from bms_estimator.mqtt.connection import check as check_broker_settings
 from bms_estimator.process.runtime import stop_on_signal
 from bms_estimator.settings.outputs import MqttSettings
-from bms_estimator.settings.pack import DeviceName
 
 PAST_BLOCKS = 30 * 24 * 60
 """Number of blocks before the present at which packs faster than real time begin by default: 30 days."""
+CONNECTIONS = 4
+"""Number of MQTT connections that all edges share."""
 MAX_PACKS = 999_999
 """Maximum number of packs, because their names end in a number of six digits."""
 
@@ -32,14 +32,8 @@ def simulate(
     mqtt: Annotated[
         str | None,
         typer.Option(
-            help="address of the fleet server, mqtt://host:port or mqtts://host:port; separate several nodes with commas"
+            help="address of a fleet server without tenants, mqtt://host:port; separate several nodes with commas"
         ),
-    ] = None,
-    username: Annotated[str | None, typer.Option(help="MQTT user that may publish for all packs")] = None,
-    password_file: Annotated[Path | None, typer.Option(help="file with the password of this user")] = None,
-    ca: Annotated[
-        Path | None,
-        typer.Option(help="file with the certificate authority of the server; default: the system's certificates"),
     ] = None,
     speed: Annotated[float, typer.Option(parser=decimal(1e-3, 1e5), help="speed relative to real time")] = 1.0,
     blocks: Annotated[
@@ -59,12 +53,7 @@ def simulate(
             show_default=False,
         ),
     ] = None,
-    prefix: Annotated[str, typer.Option(help="prefix of the packs' names")] = "sim",
-    connections: Annotated[
-        int, typer.Option(parser=whole(1, 100), help="number of MQTT connections that all edges share")
-    ] = 4,
     table: Annotated[Path | None, typer.Option(help="write the table for `fleet packs load` to this file")] = None,
-    truth: Annotated[Path | None, typer.Option(help="write the true parameters of the packs to this CSV file")] = None,
 ) -> None:
     """Simulate the edges of many packs, each of which sends a block of samples a minute.
 
@@ -74,23 +63,25 @@ def simulate(
     The samples of a block depend only on the seed, the pack and the number of the block.
     With --table and without --mqtt, only the table is written.
     """
-    if mqtt is None and table is None and truth is None:
+    if mqtt is None and table is None:
         raise UserError("give --mqtt mqtt://host:port, or --table OUT.csv to write only the table of the packs")
-    fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin, speed, blocks), prefix=_valid_prefix(prefix))
-    for path, text in ((table, fleet.table), (truth, fleet.truth_table)):
-        if path is not None:
-            write_text(path, text())
+    fleet = SimulatedFleet(packs, seed=seed, begin_ns=_begin_ns(begin, speed, blocks))
+    if table is not None:
+        write_text(table, fleet.table())
     if mqtt is not None:
-        settings = _broker_settings(mqtt, username=username, password_file=password_file, ca_file=ca)
-        typer.echo(asyncio.run(_run(fleet, settings, connections, speed, blocks)))
+        try:
+            settings = MqttSettings.model_validate({"url": tuple(mqtt.split(","))})
+        except ValidationError as error:
+            raise UserError(
+                f"--mqtt {without_secrets(mqtt)}: {error.errors()[0]['msg'].removeprefix('Value error, ')}"
+            ) from None
+        typer.echo(asyncio.run(_run(fleet, settings, speed, blocks)))
 
 
-async def _run(
-    fleet: SimulatedFleet, settings: MqttSettings, connections: int, speed: float, blocks: int | None
-) -> Report:
+async def _run(fleet: SimulatedFleet, settings: MqttSettings, speed: float, blocks: int | None) -> Report:
     start_s = time.time() - BLOCK_S / speed  # a block earlier, so that the first blocks are sent within the next minute
     edges = SimulatedEdges(fleet, start_s=start_s, speed=speed, last=blocks)
-    return await run_edges(fleet, edges, settings, connections=connections, stop=stop_on_signal(), report=typer.echo)
+    return await run_edges(fleet, edges, settings, connections=CONNECTIONS, stop=stop_on_signal(), report=typer.echo)
 
 
 def _begin_ns(begin: datetime | None, speed: float, blocks: int | None) -> int:
@@ -104,35 +95,3 @@ def _begin_ns(begin: datetime | None, speed: float, blocks: int | None) -> int:
     if not math.isfinite(begin.timestamp()) or begin.timestamp() <= 0:
         raise UserError(f"--begin {begin}: must be after 1970")
     return int(begin.timestamp()) * 10**9
-
-
-def _valid_prefix(prefix: str) -> str:
-    try:
-        return TypeAdapter(DeviceName).validate_python(prefix)
-    except ValidationError:
-        raise UserError(f"--prefix {prefix}: must consist of letters, digits, _ and -") from None
-
-
-def _broker_settings(url: str, **options: str | Path | None) -> MqttSettings:
-    """Return the connection settings from the options of the command line.
-
-    Raises:
-        UserError: An option is invalid.
-    """
-    try:
-        settings = MqttSettings.model_validate({"url": tuple(url.split(",")), **options})
-        check_broker_settings(settings)
-    except ValidationError as error:
-        raise UserError(
-            f"--mqtt {without_secrets(url)}: {error.errors()[0]['msg'].removeprefix('Value error, ')}"
-        ) from None
-    except UserError as error:
-        raise UserError(_with_option_names(str(error))) from None
-    return settings
-
-
-def _with_option_names(message: str) -> str:
-    """Replace names of settings in an error by the options that set them."""
-    for setting, option in (("url", "--mqtt"), ("password_file", "--password-file"), ("ca_file", "--ca")):
-        message = message.replace(f"mqtt.{setting} = ", f"{option} ")
-    return message

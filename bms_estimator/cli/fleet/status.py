@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, on_server
 from bms_estimator.cli.options.output import count_text, print_table
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:
+    from nats.aio.client import Client
+
     from bms_estimator.fleet.heartbeat import Heartbeat
     from bms_estimator.fleet.nats.dead_packs import DeadPacks
 
@@ -39,7 +41,7 @@ def status(
     The output lists errors of workers, refused partitions, unknown packs that send blocks, packs with dead letters, and packs whose edge's
     clock is wrong. A warning follows if more than half of the stream is filled by blocks that no checkpoint includes.
     """
-    heartbeats = asyncio.run(_receive_heartbeats((server, creds, ca)))
+    heartbeats = on_server((server, creds, ca), _receive_heartbeats)
     print_table(COLUMNS, [_row(each) for each in heartbeats])
     for heartbeat in heartbeats:
         trouble = [f"{heartbeat.id}: {heartbeat.trouble}"] if heartbeat.trouble else []
@@ -47,7 +49,7 @@ def status(
             typer.echo(line)
     if not heartbeats:
         typer.echo("no worker")
-    for line in asyncio.run(_stream_lines((server, creds, ca))):
+    for line in on_server((server, creds, ca), _stream_lines):
         typer.echo(line)
     if blocks is not None:
         _check_block_version(heartbeats, blocks)
@@ -120,48 +122,45 @@ def _check_block_version(heartbeats: "list[Heartbeat]", version: int) -> None:
     typer.echo(f"all workers read blocks of version {version}: edges that send them can start")
 
 
-async def _stream_lines(address: ServerAddress) -> list[str]:
+async def _stream_lines(nc: "Client") -> list[str]:
     """Return lines about dead letters and unsaved blocks; a line with the reason if the streams cannot be read."""
     from nats.errors import Error as NatsError  # noqa: PLC0415 - NATS is optional
 
     from bms_estimator.fleet.nats.dead_packs import DeadPackReader  # noqa: PLC0415
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
+    from bms_estimator.fleet.nats.stream_reader import StreamError  # noqa: PLC0415
     from bms_estimator.fleet.nats.streams import partitions_of  # noqa: PLC0415
     from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks  # noqa: PLC0415
 
-    async with connected(*address) as nc:
-        try:
-            async with asyncio.timeout(STREAMS_TIMEOUT_S):
-                partitions = await partitions_of(nc)
-                if partitions is None:
-                    return ["the server has no streams yet: was `fleet serve` started?"]
-                warning = (await unsaved_blocks(nc, range(partitions))).warning
-                return [*_dead_letters(await DeadPackReader(nc).read()), *([warning] if warning else [])]
-        except (TimeoutError, NatsError, UserError) as error:
-            hint = "in a cluster, are most nodes up? Is or was the disk full? Then free space and restart `fleet serve`"
-            return [f"the streams cannot be read ({str(error) or 'no answer'}): {hint}"]
+    try:
+        async with asyncio.timeout(STREAMS_TIMEOUT_S):
+            partitions = await partitions_of(nc)
+            if partitions is None:
+                return ["the server has no streams yet: was `fleet serve` started?"]
+            warning = (await unsaved_blocks(nc, range(partitions))).warning
+            return [*_dead_letters(await DeadPackReader(nc).read()), *([warning] if warning else [])]
+    except (TimeoutError, NatsError, StreamError, UserError) as error:
+        hint = "in a cluster, are most nodes up? Is or was the disk full? Then free space and restart `fleet serve`"
+        return [f"the streams cannot be read ({str(error) or 'no answer'}): {hint}"]
 
 
-async def _receive_heartbeats(address: ServerAddress) -> "list[Heartbeat]":
+async def _receive_heartbeats(nc: "Client") -> "list[Heartbeat]":
     """Return the newest heartbeat of each worker, sorted by name, after two intervals. Report unreadable ones."""
     from pydantic import ValidationError  # noqa: PLC0415 - loading takes time
 
     from bms_estimator.edge import subjects  # noqa: PLC0415 - NATS is optional
     from bms_estimator.fleet.heartbeat import HEARTBEAT_S, Heartbeat  # noqa: PLC0415
-    from bms_estimator.fleet.nats.one_shot_connection import connected  # noqa: PLC0415
 
     newest, unreadable = dict[str, Heartbeat](), set[str]()
-    async with connected(*address) as nc:
-        subscription = await nc.subscribe(subjects.worker())
-        await asyncio.sleep(2.0 * HEARTBEAT_S)
-        while subscription.pending_msgs:
-            message = await subscription.next_msg()
-            try:
-                heartbeat = Heartbeat.model_validate_json(message.data)
-            except ValidationError:
-                unreadable.add(message.subject)
-            else:
-                newest[heartbeat.id] = heartbeat
+    subscription = await nc.subscribe(subjects.worker())
+    await asyncio.sleep(2.0 * HEARTBEAT_S)
+    while subscription.pending_msgs:
+        message = await subscription.next_msg()
+        try:
+            heartbeat = Heartbeat.model_validate_json(message.data)
+        except ValidationError:
+            unreadable.add(message.subject)
+        else:
+            newest[heartbeat.id] = heartbeat
     for subject in sorted(unreadable):
         typer.echo(f"warning: the heartbeat on {subject} is unreadable: is this worker of a later version?", err=True)
     return [newest[name] for name in sorted(newest) if not newest[name].leaving]

@@ -18,11 +18,11 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.demo import faulty_packs
-from bms_estimator.fleet.demo.observer import OBSERVED_PACKS, Observer
+from bms_estimator.fleet.demo.observer import Observer
 from bms_estimator.fleet.demo.processes import LOOPBACK, TIMEOUT_S, Processes, free_port
 from bms_estimator.fleet.demo.progress import Progress
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
-from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.process.runtime import until_first_ends
 
@@ -41,7 +41,7 @@ async def result_lines(nc: Client, observer: Observer, takeover_s: float, lags_b
         takeover_s: Time from the kill to the takeover of the last partition [s].
         lags_before_kill: Number of ``observer.lags_s`` before the kill.
     """
-    counters, compared = observer.counters, max(1, len(observer.errors))
+    counters = observer.counters
     entries = await read_bucket(nc, subjects.CHECKPOINTS_BUCKET)
     pointers = [CheckpointPointer.model_validate_json(data) for data in entries.values()]
     before_s, after_s = (
@@ -56,7 +56,7 @@ async def result_lines(nc: Client, observer: Observer, takeover_s: float, lags_b
         ("takeover after the kill", f"{takeover_s:.1f} s"),
         ("largest lag before the kill", f"{before_s:.1f} s"),
         ("largest lag after the kill", f"{after_s:.1f} s"),
-        ("SOC estimates within 2 std of the truth", f"{100.0 * observer.within / compared:.0f} %"),
+        ("SOC estimates within 2 std of the truth", f"{100.0 * observer.within / max(1, observer.compared):.0f} %"),
         ("checkpoints: the last two of each partition", f"{sum(len(each.kept) for each in pointers):,}"),
         ("checkpoints: daily, stored for 30 days", f"{sum(len(each.daily) for each in pointers):,}"),
     )
@@ -227,7 +227,6 @@ async def _start_edges(
         f"   {SPEED:g} times as fast as real ones. The workers estimate SOC, capacity and resistances.\n"
         "   They do not know the SOC at the start, and learn it from the voltage.\n"
         "   The lag is the longest time from the last sample of a block to its estimate.\n"
-        f"   The SOC error is the mean of up to {OBSERVED_PACKS} packs.\n"
     )
     await processes.until(lambda: observer.all_partitions_owned)
     return Progress(observer, demo.report)

@@ -27,15 +27,15 @@ class Observer:
         partitions: Numbers of the partitions that contain packs.
         workers: Last heartbeat of each worker and the monotonic clock of its arrival [s].
         lags_s: Lags of all heartbeats [s].
-        errors: Estimated minus true SOC of all compared estimates.
-        within: Number of estimates whose true SOC is within two standard deviations.
+        compared: Number of estimates that are compared with the true SOC.
+        within: Number of these estimates whose true SOC is within two standard deviations.
         dead: Names of the killed workers.
     """
 
     partitions: set[int]
     workers: dict[str, tuple[float, Heartbeat]] = field(default_factory=dict)
     lags_s: list[float] = field(default_factory=list)
-    errors: list[float] = field(default_factory=list)
+    compared: int = 0
     within: int = 0
     dead: set[str] = field(default_factory=set)
 
@@ -92,7 +92,7 @@ class Observer:
             estimate = json.loads(message.data)
             pack = np.array([index[message.subject.split(".")[1]]])
             error = estimate["soc"] - float(fleet.soc(pack, np.array([estimate["board_time_s"]]))[0])
-            self.errors.append(error)
+            self.compared += 1
             self.within += abs(error) <= 2.0 * estimate["soc_std"]
 
         await nc.subscribe(subjects.worker(), cb=on_heartbeat)

@@ -3,9 +3,6 @@
 import asyncio
 import time
 from collections.abc import Callable
-from typing import NamedTuple
-
-import numpy as np
 
 from bms_estimator.fleet.demo.observer import Observer
 from bms_estimator.fleet.demo.processes import POLL_S, Processes
@@ -13,16 +10,7 @@ from bms_estimator.fleet.heartbeat import HEARTBEAT_S
 
 INTERVAL_S = 5.0
 """Interval between two rows [s]."""
-HEADING = "    time   blocks/s      lag   SOC error   partitions"
-
-
-class _RowEnd(NamedTuple):
-    """Time at the end of a row, and numbers of the values received until then."""
-
-    elapsed_s: float
-    processed: int
-    lags: int
-    errors: int
+HEADING = "    time   blocks/s      lag   partitions"
 
 
 class Progress:
@@ -36,7 +24,6 @@ class Progress:
     def __init__(self, observer: Observer, report: Callable[[str], object]) -> None:
         self._observer, self._report = observer, report
         self._begin_s = time.monotonic()
-        self._last_row_end = _RowEnd(0.0, 0, 0, 0)
 
     @property
     def elapsed_s(self) -> float:
@@ -50,26 +37,14 @@ class Progress:
             UserError: A process has ended.
         """
         self._report(HEADING)
-        self._last_row_end = self._row_end()
-        end_s = max(until_s, self._last_row_end.elapsed_s + HEARTBEAT_S)  # each row needs a heartbeat
-        while end_s - self._last_row_end.elapsed_s > HEARTBEAT_S / 2.0:
-            row_s = min(self._last_row_end.elapsed_s + INTERVAL_S, end_s)
-            while self.elapsed_s < row_s:
+        end_s = -1.0
+        while end_s < until_s:
+            begin_s, processed, lags = self.elapsed_s, self._observer.processed, len(self._observer.lags_s)
+            end_s = min(begin_s + INTERVAL_S, max(until_s, begin_s + HEARTBEAT_S))  # each row needs a heartbeat
+            while self.elapsed_s < end_s:
                 processes.check()
                 await asyncio.sleep(POLL_S)
-            self._report(self._row())
-
-    def _row_end(self) -> _RowEnd:
-        observer = self._observer
-        return _RowEnd(self.elapsed_s, observer.processed, len(observer.lags_s), len(observer.errors))
-
-    def _row(self) -> str:
-        """Return a row of the table for the time since the previous row."""
-        observer, before, now = self._observer, self._last_row_end, self._row_end()
-        self._last_row_end = now
-        rate = (now.processed - before.processed) / (now.elapsed_s - before.elapsed_s)
-        lag_s = max(observer.lags_s[before.lags :], default=0.0)
-        errors = observer.errors[before.errors :]
-        error = f"{100.0 * float(np.mean(np.abs(errors))):.1f} %" if errors else "-"
-        owners = ", ".join(f"{name} {len(each.partitions)}" for name, each in sorted(observer.alive.items()))
-        return f"{now.elapsed_s:6.0f} s {rate:10,.0f} {lag_s:6.1f} s {error:>11}   {owners}"
+            rate = (self._observer.processed - processed) / (self.elapsed_s - begin_s)
+            lag_s = max(self._observer.lags_s[lags:], default=0.0)
+            owners = ", ".join(f"{name} {len(each.partitions)}" for name, each in sorted(self._observer.alive.items()))
+            self._report(f"{self.elapsed_s:6.0f} s {rate:10,.0f} {lag_s:6.1f} s   {owners}")

@@ -27,7 +27,7 @@ from pydantic import ValidationError
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import FitRequest
 from bms_estimator.fleet.fits.pack_history import FitAnswer, FitJob, run_job
-from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, close, connect, error_text
+from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text, run_connected
 from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.packs.pack_type import type_estimator
@@ -57,7 +57,7 @@ class Options:
     """Options of the process.
 
     Attributes:
-        servers, creds, ca: Arguments of ``connect``.
+        servers, creds, ca: Arguments of ``run_connected``.
         processes: Number of fits that run in parallel.
     """
 
@@ -73,11 +73,11 @@ async def fit_packs(options: Options, stop: asyncio.Event) -> None:
     Raises:
         UserError: An option cannot be used, or the server has closed the connection permanently.
     """
-    nc = await connect(options.servers, NAME, creds=options.creds, ca=options.ca)
-    try:
+
+    async def run(nc: Client) -> None:
         await until_first_ends(Fitter(nc, options).run(), stop.wait())
-    finally:
-        await close(nc)
+
+    await run_connected(run, stop, NAME, (options.servers, options.creds, options.ca))
 
 
 class Fitter:

@@ -4,7 +4,6 @@ Rows and results are arrays in the format of ``numpy.savez_compressed``, so that
 """
 
 import io
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, Any, NamedTuple
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from bms_estimator.checkpoint.arrays_file import to_bytes
 from bms_estimator.fleet.packs.pack_type import Digest
 from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.fit import PackFit
@@ -78,13 +78,6 @@ class FitResult(NamedTuple):
 
 _WEAKEST = "weakest_"
 """Prefix of the arrays of ``FitResult.weakest``."""
-
-
-def to_bytes(arrays: Mapping[str, Any]) -> bytes:
-    """Encode arrays and scalars by name."""
-    packed = io.BytesIO()
-    np.savez_compressed(packed, **arrays)
-    return packed.getvalue()
 
 
 def from_bytes(data: bytes) -> dict[str, NDArray[Any]]:

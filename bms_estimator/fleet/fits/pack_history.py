@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bms_estimator.checkpoint.arrays_file import to_bytes
 from bms_estimator.estimator.restore import checked_rows
 from bms_estimator.fleet.fits.messages import (
     FitRequest,
@@ -15,7 +16,6 @@ from bms_estimator.fleet.fits.messages import (
     encode_result,
     from_bytes,
     position_of,
-    to_bytes,
 )
 from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.pack_model.bank_monitor import BankMonitor

@@ -179,7 +179,7 @@ WORKER: tuple[Definition[Heartbeat], ...] = (
     ),
     Definition(
         "bms_fleet_worker_waiting_summaries",
-        "Hourly summaries and messages of histories that are not acknowledged yet",
+        "Hourly summaries, messages of histories and dead letters that are not acknowledged yet",
         lambda h: h.hours_waiting,
     ),
     Definition(

@@ -1,4 +1,4 @@
-"""Reader of the changes of a key-value bucket by polling."""
+"""Readers of a key-value bucket: of all values, and of the changes by polling."""
 
 from collections.abc import Callable
 
@@ -57,6 +57,23 @@ class BucketReader:
         self.lost = (self.lost | self._keys if is_new_bucket else self.lost) - read_keys
         self._keys = read_keys if first == 1 else self._keys | read_keys
         self._next_sequence, self._created = last + 1, info.created
+
+
+async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
+    """Return all values of a bucket by key.
+
+    Raises:
+        StreamError: The server does not respond, or has no such bucket.
+    """
+    values = dict[str, bytes]()
+    async for batch in read_stream(nc, stream_of(bucket), subject_of(bucket, ">")):
+        for message in batch:
+            key, data = parse_entry(bucket, message)
+            if data is None:
+                values.pop(key, None)
+            else:
+                values[key] = data
+    return values
 
 
 def parse_entry(bucket: str, message: StoredMessage) -> tuple[str, bytes | None]:

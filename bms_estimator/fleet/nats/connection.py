@@ -6,7 +6,7 @@ import logging
 import re
 import ssl
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import nats.aio.client
@@ -18,6 +18,7 @@ from nats.aio.transport import TcpTransport
 
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.runtime import end, until_first_ends
 
 _TEXT_BY_CLASS: dict[type[BaseException], str] = {
     nats.js.errors.NotFoundError: "a stream is missing on the server: create it with `bms-estimator fleet serve`",
@@ -125,6 +126,37 @@ async def connect(
         await close(nc)  # the library leaves the socket open
         raise
     return nc
+
+
+async def run_connected(
+    run: Callable[[Client], Awaitable[None]],
+    stop: asyncio.Event,
+    name: str,
+    address: tuple[str, Path | None, Path | None],
+) -> None:
+    """Connect, run a service, and close the connection. If ``stop`` is set before a server is found, nothing is run.
+
+    Args:
+        run: Runs the service until ``stop`` is set.
+        stop: Event that ends the service.
+        name: Name of the connection.
+        address: Arguments ``servers``, ``creds`` and ``ca`` of ``connect``.
+
+    Raises:
+        UserError: The address cannot be used.
+    """
+    servers, creds, ca = address
+    connecting = asyncio.ensure_future(connect(servers, name, creds=creds, ca=ca))
+    # a stop cancels only ``asyncio.wait``; therefore ``connecting`` is done only if there is a connection or an error
+    await until_first_ends(asyncio.wait([connecting]), stop.wait())
+    if not connecting.done():
+        await end(connecting)
+        return
+    nc = connecting.result()
+    try:
+        await run(nc)
+    finally:
+        await close(nc)
 
 
 async def close(nc: Client) -> None:

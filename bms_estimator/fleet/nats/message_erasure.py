@@ -1,18 +1,16 @@
 """Erasure of a stream's messages. A purge would leave their bytes in the server's files for an unlimited time."""
 
 import asyncio
-import json
+import contextlib
 
 from nats.aio.client import Client
+from nats.js import JetStreamContext
+from nats.js.errors import NotFoundError
 
-from bms_estimator.fleet.nats.stream_reader import StreamError, read_stream
+from bms_estimator.fleet.nats.stream_reader import read_stream
 
 MAX_PENDING = 200
 """Maximum number of concurrent requests."""
-RESPONSE_TIMEOUT_S = 10.0
-"""Timeout of a request [s]."""
-NOT_FOUND = 404
-"""Error code of the server for a message that is already removed."""
 
 
 async def erase_messages(nc: Client, stream: str, subject: str) -> int:
@@ -24,22 +22,19 @@ async def erase_messages(nc: Client, stream: str, subject: str) -> int:
         subject: Subject of the messages; may have wildcards.
 
     Raises:
-        StreamError: The server does not respond or rejects a request.
-        nats.errors.Error: An error of the connection.
+        StreamError: The server does not respond, or rejects reading the stream.
+        nats.errors.Error: An error of the connection, or the server rejects a request.
     """
-    count = 0
+    js, count = nc.jetstream(), 0
     async for batch in read_stream(nc, stream, subject):
         sequences = [message.sequence for message in batch]
         for first in range(0, len(sequences), MAX_PENDING):
-            await asyncio.gather(*(_erase(nc, stream, each) for each in sequences[first : first + MAX_PENDING]))
+            await asyncio.gather(*(_erase(js, stream, each) for each in sequences[first : first + MAX_PENDING]))
         count += len(sequences)
     return count
 
 
-async def _erase(nc: Client, stream: str, sequence: int) -> None:
-    """Remove one message. The server overwrites a message with random bytes unless the request has ``no_erase``."""
-    request = json.dumps({"seq": sequence}).encode()
-    response = await nc.request(f"$JS.API.STREAM.MSG.DELETE.{stream}", request, timeout=RESPONSE_TIMEOUT_S)
-    error = json.loads(response.data).get("error")
-    if error and error.get("code") != NOT_FOUND:
-        raise StreamError(f"the server rejects removing a message of {stream}: {error.get('description', '')}")
+async def _erase(js: JetStreamContext, stream: str, sequence: int) -> None:
+    """Remove one message. The server overwrites its bytes, because the request does not have ``no_erase``."""
+    with contextlib.suppress(NotFoundError):  # removed meanwhile
+        await js.delete_msg(stream, sequence)

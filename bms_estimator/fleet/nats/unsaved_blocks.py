@@ -10,11 +10,11 @@ from typing import NamedTuple
 from nats.aio.client import Client
 from nats.js.api import RawStreamMsg
 from nats.js.client import JetStreamContext
-from nats.js.errors import KeyNotFoundError, NotFoundError
-from nats.js.kv import KeyValue
+from nats.js.errors import NotFoundError
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer, pointer_key
 
 WARNING_SHARE = 0.5
@@ -63,15 +63,16 @@ async def unsaved_blocks(nc: Client, partitions: Iterable[int]) -> UnsavedShare:
         partitions: Numbers of the partitions whose checkpoints are considered.
 
     Raises:
-        nats.errors.Error: The stream or the bucket cannot be read.
+        StreamError: The bucket cannot be read.
+        nats.errors.Error: The stream cannot be read.
     """
     js, now_s = nc.jetstream(), time.time()
     raw = await js.stream_info(subjects.RAW_STREAM)
-    bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
+    pointers = await read_bucket(nc, subjects.CHECKPOINTS_BUCKET)
     max_blocks = max(raw.config.max_msgs_per_subject or 0, 0)
     oldest_sequence, oldest_s, max_of_packs = raw.state.last_seq + 1, now_s, UnsavedShare()
     for partition in partitions:
-        first = await _saved_sequence(bucket, partition) + 1
+        first = _saved_sequence(pointers.get(pointer_key(partition))) + 1
         message = await _message(js, subjects.stored(partition), first)
         if message is None:
             continue
@@ -124,10 +125,10 @@ def _time_s(message: RawStreamMsg, now_s: float) -> float:
     return now_s if message.time is None else message.time.timestamp()
 
 
-async def _saved_sequence(bucket: KeyValue, partition: int) -> int:
+def _saved_sequence(pointer: bytes | None) -> int:
     """Return the sequence number of the last message in a partition's last checkpoint; 0 without a checkpoint."""
     try:
-        pointer = CheckpointPointer.model_validate_json((await bucket.get(pointer_key(partition))).value or b"")
-    except (KeyNotFoundError, ValidationError):
+        kept = CheckpointPointer.model_validate_json(pointer or b"").kept
+    except ValidationError:
         return 0
-    return pointer.kept[0].sequence if pointer.kept else 0
+    return kept[0].sequence if kept else 0

@@ -12,8 +12,8 @@ from nats.aio.client import Client
 from nats.js.errors import KeyWrongLastSequenceError
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
-from bms_estimator.fleet.nats.bucket_reader import BucketReader, parse_entry, stream_of, subject_of
-from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StreamError, read_stream
+from bms_estimator.fleet.nats.bucket_reader import BucketReader, read_bucket, stream_of, subject_of
+from bms_estimator.fleet.nats.stream_reader import RESPONSE_TIMEOUT_S, StreamError
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 
 POLL_S = 1.0
@@ -100,23 +100,6 @@ class PackBucket:
                 await put_new(self._nc, bucket, {key: values[key] for key in lost})
                 log.error("the server has lost the table of packs: it is written again", bucket=bucket, rows=len(lost))
             self._readers[bucket].lost.clear()
-
-
-async def read_bucket(nc: Client, bucket: str) -> dict[str, bytes]:
-    """Return all values of a bucket by key.
-
-    Raises:
-        StreamError: The server does not respond, or has no such bucket.
-    """
-    values = dict[str, bytes]()
-    async for batch in read_stream(nc, stream_of(bucket), subject_of(bucket, ">")):
-        for message in batch:
-            key, data = parse_entry(bucket, message)
-            if data is None:
-                values.pop(key, None)
-            else:
-                values[key] = data
-    return values
 
 
 async def write_bucket(nc: Client, bucket: str, values: Mapping[str, bytes], *, remove: bool = False) -> WriteCounts:

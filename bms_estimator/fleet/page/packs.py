@@ -80,8 +80,8 @@ class FleetPacks:
         self._states: list[bytes] = []
         self._parameters: dict[str, bytes] = {}
         self._types: dict[str, int] = {UNLISTED: 0}  # index of each type
-        self.states, self.damaged = 0, 0
-        """Number of received states; number of those that are not a JSON object."""
+        self.states = 0
+        """Number of received states."""
 
     def set_type(self, name: str, type_name: str | None) -> None:
         """Set the type of a pack, such as ``lfp 16s2p``; None: the pack is not in the table of packs."""
@@ -94,7 +94,6 @@ class FleetPacks:
         self.states += 1
         values = _object(state)
         if values is None:
-            self.damaged += 1
             return
         row = self._row(name)
         row["heard_s"] = now_s
@@ -157,7 +156,6 @@ class FleetPacks:
                 "known": int(counted.sum()),
                 "alive": int(alive.sum()),
                 "silent": int(silent.sum()),
-                "unlisted": int((counted & ~rows["listed"]).sum()),
                 "uncertain": int((alive & (rows["soc_std"] > UNCERTAIN_STD)).sum()),
             },
             "types": self._types_overview(rows, counted, alive),

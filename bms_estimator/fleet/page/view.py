@@ -1,5 +1,6 @@
 """Overview of a fleet for its page. No function reads a clock; the time is an argument."""
 
+import contextlib
 import json
 from collections import deque
 from typing import Any
@@ -33,8 +34,6 @@ class FleetView:
         self._received_counts = deque([(now_s, 0)])  # time, and number of states received until then
         self.listening = False
         """True while connected to the server; otherwise the values are outdated."""
-        self.damaged = 0
-        """Number of invalid heartbeats."""
 
     def set_connected(self, now_s: float) -> None:
         """Record that the connection is (re-)established."""
@@ -46,12 +45,10 @@ class FleetView:
         self.listening = False
 
     def receive_worker(self, data: bytes, now_s: float) -> None:
-        """Store a worker's heartbeat."""
-        try:
+        """Store a worker's heartbeat, unless it is invalid."""
+        with contextlib.suppress(ValueError):
             heartbeat = Heartbeat.model_validate(from_json(data, allow_inf_nan=False))  # the page's JSON has no NaN
             self.workers.receive(heartbeat, now_s)
-        except ValueError:
-            self.damaged += 1
 
     def receive_unknown(self, name: str, reason: str) -> None:
         """Store the reason why a worker defers the blocks of a pack."""
@@ -81,7 +78,6 @@ class FleetView:
             "time": iso_utc(wall_s),
             "listening_s": round(now_s - self._since_s, 1),
             "states_per_s": self._rate(now_s),
-            "damaged": self.packs.damaged + self.damaged,
         }
 
     def _rate(self, now_s: float) -> float | None:

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from bms_estimator.edge.subjects import BlockRequest, block_request, raw
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
-from bms_estimator.mqtt.connection import brokers, password, tls_context
+from bms_estimator.mqtt.connection import brokers, tls_context
 from bms_estimator.settings.outputs import MqttSettings
 
 POLL_S = 0.1
@@ -75,7 +75,6 @@ class _Connection:
         self._brokers = itertools.cycle(brokers(settings))
         self.published, self.acknowledged = 0, 0
         self._client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=f"simulated-{uuid.uuid4().hex[:12]}")
-        self._client.username_pw_set(settings.username, password(settings))
         if any(broker.tls for broker in brokers(settings)):
             self._client.tls_set_context(tls_context(settings))
         self._client.max_inflight_messages_set(MAX_IN_FLIGHT)
@@ -134,14 +133,14 @@ async def run_edges(
     Args:
         fleet: Simulated packs.
         edges: Simulated edges.
-        settings: Address and credentials of the server.
+        settings: Address of the server.
         connections: Number of connections for all edges.
         stop: Ends the run when set.
         report: Receives progress lines.
         quiet_s: Time after the last block in which workers may request missing blocks [s].
 
     Raises:
-        UserError: An address, password or certificate cannot be used.
+        UserError: An address cannot be used.
     """
     replies: deque[tuple[str, bytes]] = deque()
     # only the first connection subscribes, because the replies to all edges arrive on it

@@ -151,7 +151,6 @@ class SimulatedFleet:
         packs: Number of packs.
         seed: Seed of all random values.
         begin_ns: Creation time of the first edge's store [ns since 1970]. The other stores follow within a minute.
-        prefix: Prefix of the packs' names.
 
     Attributes:
         names: Names of the packs.
@@ -159,9 +158,9 @@ class SimulatedFleet:
         truth: Ground truth of the packs.
     """
 
-    def __init__(self, packs: int, *, seed: int, begin_ns: int, prefix: str = "sim") -> None:
+    def __init__(self, packs: int, *, seed: int, begin_ns: int) -> None:
         pack = np.arange(packs, dtype=np.int64)
-        self.names = tuple(f"{prefix}-{i:06d}" for i in range(packs))
+        self.names = tuple(f"sim-{i:06d}" for i in range(packs))
         self._salt = np.uint64(seed % 2**64)
         self._curves = tuple(_Curves(kind) for kind in KINDS)
         self._kind_index = pack % len(KINDS)
@@ -231,13 +230,6 @@ class SimulatedFleet:
         lines += [
             table_row(name, KINDS[index]) for name, index in zip(self.names, self._kind_index.tolist(), strict=True)
         ]
-        return "\n".join(lines) + "\n"
-
-    def truth_table(self) -> str:
-        """Return the ground truth as CSV, for comparison with estimates."""
-        rows = zip(self.names, self.truth.capacity_as.tolist(), self.truth.resistance.tolist(), strict=True)
-        lines = ["pack,capacity_ah,resistance_factor"]
-        lines += [f"{name},{capacity_as / 3600.0:.4f},{factor:.4f}" for name, capacity_as, factor in rows]
         return "\n".join(lines) + "\n"
 
     def soc(self, packs: Ints, time_s: Floats) -> Floats:

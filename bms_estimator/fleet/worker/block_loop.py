@@ -6,8 +6,9 @@ state includes all earlier ones. All other messages need requests to the server,
 """
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 
 from bms_estimator.fleet.worker.block_result import ResultPublisher
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
@@ -121,7 +122,9 @@ class DeliveredMessages:
         if not self._consumer.waiting or not self.is_caught_up or self.pin_lapsed:
             return False
         delivered = self._consumer.waiting[0]
-        return delivered.follows and delivered.pin == self.pin and not self._guard.is_guarded(delivered.sequence)
+        return (
+            delivered.follows and delivered.pin == self.pin and not self._guard.is_guarded(delivered.message.sequence)
+        )
 
     async def publish(self) -> None:
         """Publish the results of ``process_next``, and request further messages."""
@@ -148,12 +151,18 @@ class DeliveredMessages:
         """Begin a pass of the task of the partition: later calls of ``wake_up`` cause another pass."""
         self._wake_up.clear()
 
-    async def wait(self) -> None:
-        """Let the block loop process messages until the task of the partition is woken up."""
+    @contextlib.contextmanager
+    def served(self) -> Iterator[None]:
+        """Let the block loop process messages while the context lasts."""
         self._is_task_waiting = True
         if self._consumer.waiting:
             self._block_loop.add(self)
         try:
-            await self._wake_up.wait()
+            yield
         finally:
             self._is_task_waiting = False
+
+    async def wait(self) -> None:
+        """Let the block loop process messages until the task of the partition is woken up."""
+        with self.served():
+            await self._wake_up.wait()

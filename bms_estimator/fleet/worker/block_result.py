@@ -6,10 +6,12 @@ and dead letters are queued until the server acknowledges them.
 
 import asyncio
 from collections import deque
+from collections.abc import Mapping
 from itertools import islice
 from typing import NamedTuple
 
 from nats.aio.client import Client
+from nats.js.api import Header
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.subjects import BlockRequest
@@ -29,12 +31,16 @@ class AlarmMessage(NamedTuple):
 
 
 class QueuedMessage(NamedTuple):
-    """Hourly summary, rows of a pack's history, or request for a fit, which the server must store."""
+    """Hourly summary, rows of a pack's history, request for a fit, or dead letter, which the server must store."""
 
     subject: str
     data: bytes
-    message_id: str
-    """Equal for all workers, so that the server drops repetitions."""
+    headers: Mapping[str, str]
+
+
+def stored_once(subject: str, data: bytes, message_id: str) -> QueuedMessage:
+    """Return a message whose id is equal for all workers, so that the server drops repetitions."""
+    return QueuedMessage(subject, data, {Header.MSG_ID.value: message_id})
 
 
 class BlockResult(NamedTuple):
@@ -50,6 +56,7 @@ class BlockResult(NamedTuple):
         hours: Message ids and rows of finished hours. The message id of a row is equal for all workers, so that the server
             drops repeated rows.
         history: Messages of the pack's history.
+        is_deferred: True if the message was not processed, and stays in the stream until its pack is served.
         failed: Number of blocks that were skipped because of an internal error.
         dead_reason: Reason why the block becomes a dead letter; empty if it does not become one.
     """
@@ -62,6 +69,7 @@ class BlockResult(NamedTuple):
     alarms: tuple[AlarmMessage, ...] = ()
     hours: tuple[tuple[str, bytes], ...] = ()
     history: tuple[QueuedMessage, ...] = ()
+    is_deferred: bool = False
     failed: int = 0
     dead_reason: str = ""
 
@@ -79,37 +87,29 @@ class ResultPublisher:
         nc: Connection to the tenant's NATS account.
 
     Attributes:
-        waiting: Summaries and messages of histories that the server has not acknowledged yet.
-        waiting_dead_letters: Dead letters that the server has not acknowledged yet.
+        waiting: Queued messages that the server has not acknowledged yet.
         added: Results to be published by ``publish_added``.
     """
 
     def __init__(self, nc: Client) -> None:
         self._nc = nc
         self.waiting: deque[QueuedMessage] = deque()
-        self.waiting_dead_letters: deque[DeadLetter] = deque()
         self.added: list[BlockResult] = []
         self._send_lock = asyncio.Lock()
-
-    @property
-    def is_waiting(self) -> bool:
-        """True if the server has not acknowledged all queued messages."""
-        return bool(self.waiting or self.waiting_dead_letters)
 
     def queue(self, result: BlockResult) -> None:
         """Queue the hourly summaries and the history messages of a result."""
         subject = subjects.hours(result.pack)
-        self.waiting.extend(QueuedMessage(subject, row, message_id) for message_id, row in result.hours)
+        self.waiting.extend(stored_once(subject, row, message_id) for message_id, row in result.hours)
         self.waiting.extend(result.history)
 
     def queue_dead_letter(self, letter: DeadLetter) -> None:
         """Queue a dead letter."""
-        self.waiting_dead_letters.append(letter)
+        self.waiting.append(QueuedMessage(letter.subject, letter.data, letter.headers()))
 
     def clear(self) -> None:
         """Drop the queued messages."""
         self.waiting.clear()
-        self.waiting_dead_letters.clear()
 
     async def send_queued(self) -> None:
         """Publish the queued messages in their order, and await the server's acknowledgment.
@@ -123,19 +123,11 @@ class ResultPublisher:
             while self.waiting:
                 messages = list(islice(self.waiting, MAX_PENDING))
                 await asyncio.gather(
-                    *(
-                        js.publish(each.subject, each.data, headers={"Nats-Msg-Id": each.message_id})
-                        for each in messages
-                    )
+                    *(js.publish(each.subject, each.data, headers=dict(each.headers)) for each in messages)
                 )
                 for message in messages:  # the queue was cleared meanwhile if the ownership was lost
                     if self.waiting and self.waiting[0] is message:
                         self.waiting.popleft()
-            while self.waiting_dead_letters:
-                letter = self.waiting_dead_letters[0]
-                await js.publish(letter.subject, letter.data, headers=letter.headers())
-                if self.waiting_dead_letters and self.waiting_dead_letters[0] is letter:
-                    self.waiting_dead_letters.popleft()
 
     def add(self, result: BlockResult) -> None:
         """Add a result for ``publish_added``."""

@@ -6,19 +6,18 @@ is found and skipped (``takeover``).
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Awaitable, Callable
-from functools import partial
+from dataclasses import dataclass, field
 
 import structlog
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
-from bms_estimator.fleet.nats.stream_reader import StoredMessage
-from bms_estimator.fleet.packs.table_change import is_change
 from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, BlockResult, ResultPublisher
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, is_block
+from bms_estimator.fleet.worker.pinned_consumer import RawMessage, is_block
 from bms_estimator.fleet.worker.takeover import ReplayGuard
 
 MAX_CPU_FRACTION = 0.1
@@ -32,19 +31,37 @@ MAX_PACKS = 10_000
 """Number of stored bucket levels above which levels of 0 are removed: those packs are idle."""
 
 
+@dataclass
+class Totals:
+    """Totals of a worker since its start, over its present and former partitions.
+
+    Attributes:
+        blocks, samples: Number of processed blocks and samples.
+        faults: Number of blocks skipped because of an internal error.
+        dead_letters: Number of dead letters.
+        estimation_s: Processor time of the estimation [s].
+        lag_s: Largest lag since it was last reset to None [s].
+        events: Events in the former partitions by name.
+    """
+
+    blocks: int = 0
+    samples: int = 0
+    faults: int = 0
+    dead_letters: int = 0
+    estimation_s: float = 0.0
+    lag_s: float | None = None
+    events: Counter[str] = field(default_factory=Counter)
+
+
 class CpuBudget:
     """Processor-time budget: a leaky bucket for each pack.
 
     Args:
         clock: Monotonic clock [s].
-
-    Attributes:
-        total_s: Processor time of all packs [s].
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self.total_s = 0.0
         # level of each pack's bucket [s], and the time at which the level was computed [s]
         self._levels: dict[str, tuple[float, float]] = {}
 
@@ -54,7 +71,6 @@ class CpuBudget:
 
     def charge(self, pack: str, cpu_s: float) -> None:
         """Count processor time that a pack has used [s]."""
-        self.total_s += cpu_s
         self._levels[pack] = self._level_s(pack) + min(cpu_s, MAX_CHARGE_S), self._clock()
         if len(self._levels) > MAX_PACKS:
             self._levels = {name: level for name, level in self._levels.items() if self._level_s(name)}
@@ -77,16 +93,11 @@ class BlockRunner:
         step_lock: Lock of the worker (``BlockLoop``), held while a block is processed.
         guard: Guard against blocks that kill workers.
         results: Publisher of the results.
-        on_table_change: Called with the pack after its row of the table has changed.
+        totals: Totals of the worker; updated.
         save: Writes a checkpoint.
-        on_deferred: Called after a message was deferred.
 
     Attributes:
         budget: Processor time of each pack.
-        blocks, samples: Number of processed blocks and samples.
-        faults: Number of blocks skipped because of an internal error.
-        dead_letters: Number of dead letters.
-        lag_s: Largest lag since it was last reset to None [s].
     """
 
     def __init__(
@@ -97,115 +108,88 @@ class BlockRunner:
         step_lock: asyncio.Lock,
         guard: ReplayGuard,
         results: ResultPublisher,
+        totals: Totals,
         *,
         save: Callable[[], Awaitable[None]],
-        on_deferred: Callable[[], None],
-        on_table_change: Callable[[str], None],
     ) -> None:
         self._number, self._partitions, self._worker, self._step_lock = number, partitions, worker, step_lock
-        self._guard, self._results = guard, results
-        self._save, self._on_deferred, self._on_table_change = save, on_deferred, on_table_change
+        self._guard, self._results, self._totals, self._save = guard, results, totals, save
         self.budget = CpuBudget()
-        self.blocks = self.samples = self.faults = self.dead_letters = 0
-        self.lag_s: float | None = None
 
-    async def process(self, partition: Partition, pack: str, message: StoredMessage) -> BlockResult:
+    async def process(self, partition: Partition, message: RawMessage) -> BlockResult:
         """Process a message, or defer it if its pack has exhausted its budget or has deferred messages.
 
         Raises:
             nats.errors.Error: The server does not respond.
         """
-        result = self._reject_or_defer(partition, pack, message.sequence)
-        if result is not None:
-            await asyncio.sleep(0)  # lets the event loop send heartbeats while many messages are deferred
-            return result
-        process_message = partial(partition.process, received_s=message.received_s)
-        result = await self.run(pack, message.data, message.sequence, process_message)
-        self._count_processed(partition, pack, message.data)
-        return result
-
-    def process_unguarded(self, partition: Partition, pack: str, message: DeliveredMessage) -> BlockResult:
-        """Process or defer a message that does not belong to a guarded replay, without a request to the server."""
-        result = self._reject_or_defer(partition, pack, message.sequence)
+        result = self._reject_or_defer(partition, message)
         if result is None:
-            process_message = partial(partition.process, received_s=message.received_s)
-            result = self._run_unguarded(pack, message.data, message.sequence, process_message)
-            self._count_processed(partition, pack, message.data)
+            return await self._run_guarded(partition.process, message)
+        await asyncio.sleep(0)  # lets the event loop send heartbeats while many messages are deferred
         return result
 
-    def _reject_or_defer(self, partition: Partition, pack: str, sequence: int) -> BlockResult | None:
-        """Reject or defer a message, or return None if its pack is within its budget and has no deferred messages."""
-        if subjects.partition_of(pack, self._partitions) != self._number:
-            return partition.reject_misplaced(pack, sequence)
-        if pack not in partition.deferred and not self.budget.is_exhausted(pack):
-            return None
-        self._on_deferred()
-        return partition.defer(pack, sequence)
+    def process_unguarded(self, partition: Partition, message: RawMessage) -> BlockResult:
+        """Process or defer a message that does not belong to a guarded replay, without a request to the server."""
+        return self._reject_or_defer(partition, message) or self._run(partition.process, message)
 
-    def _count_processed(self, partition: Partition, pack: str, data: bytes) -> None:
-        """Count a block, unless ``Partition.process`` has deferred it."""
-        if pack not in partition.deferred:
-            self.count_block(data)
-
-    async def run(
-        self, pack: str, data: bytes, sequence: int, process_message: Callable[..., BlockResult]
-    ) -> BlockResult:
-        """Process a message while no other block is processed. ``_run_unguarded`` describes the arguments.
+    async def process_deferred(self, partition: Partition, message: RawMessage) -> BlockResult:
+        """Process the next deferred message of a pack.
 
         Raises:
             nats.errors.Error: The server does not respond.
         """
+        return await self._run_guarded(partition.process_deferred, message)
+
+    def _reject_or_defer(self, partition: Partition, message: RawMessage) -> BlockResult | None:
+        """Reject or defer a message, or return None if its pack is within its budget and has no deferred messages."""
+        pack = message.pack
+        if subjects.partition_of(pack, self._partitions) != self._number:
+            return partition.reject_misplaced(pack, message.sequence)
+        if pack in partition.deferred or self.budget.is_exhausted(pack):
+            return partition.defer(pack, message.sequence)
+        return None
+
+    async def _run_guarded(self, process: Callable[..., BlockResult], message: RawMessage) -> BlockResult:
+        """Process a message while no other block is processed. ``_run`` describes the arguments."""
         async with self._step_lock:
             await asyncio.sleep(0)  # lets the event loop send heartbeats between two blocks
-            is_lethal = await self._guard.begin_block(sequence)
-            result = self._run_unguarded(pack, data, sequence, process_message, is_lethal=is_lethal)
-            await self._guard.end_block(sequence)
+            is_lethal = await self._guard.begin_block(message.sequence)
+            result = self._run(process, message, is_lethal=is_lethal)
+            await self._guard.end_block(message.sequence)
         if is_lethal:
             await self._save()  # the next owner must not process the block again
         return result
 
-    def _run_unguarded(
-        self,
-        pack: str,
-        data: bytes,
-        sequence: int,
-        process_message: Callable[..., BlockResult],
-        *,
-        is_lethal: bool = False,
-    ) -> BlockResult:
+    def _run(self, process: Callable[..., BlockResult], message: RawMessage, *, is_lethal: bool = False) -> BlockResult:
         """Process a message, and charge the processor time to its pack.
 
         Args:
-            pack: Name of the pack.
-            data: Bytes of the message.
-            sequence: Stream sequence number of the message.
-            process_message: ``Partition.process`` or ``Partition.process_deferred``.
+            process: ``Partition.process`` or ``Partition.process_deferred``.
+            message: The message.
             is_lethal: True if the block has killed workers.
         """
         begin_s = time.thread_time()
+        pack, data, sequence, _ = message
         try:
-            result = process_message(pack, data, sequence, is_lethal=is_lethal)
+            result = process(*message, is_lethal=is_lethal)
         except Exception:  # otherwise the message would end each worker that takes over the partition
             log.exception("a block is skipped", partition=self._number, pack=pack, sequence=sequence)
             result = BlockResult(pack, failed=1, dead_reason=INTERNAL_ERROR)
-        self.budget.charge(pack, time.thread_time() - begin_s)
-        self.faults += result.failed
+        cpu_s = time.thread_time() - begin_s
+        self.budget.charge(pack, cpu_s)
+        self._totals.estimation_s += cpu_s
+        self._totals.faults += result.failed
         self._results.queue(result)
         if result.dead_reason:
-            self._add_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
-        if is_change(data):  # a later change of the table may still have to be sent
-            self._on_table_change(pack)
+            self._totals.dead_letters += 1
+            self._results.queue_dead_letter(DeadLetter(pack, sequence, result.dead_reason, self._worker, data))
+        if not result.is_deferred and is_block(data):
+            self._count_block(data)
         return result
 
-    def count_block(self, data: bytes) -> None:
-        """Count a block and its samples, and update the lag. Other messages are not counted."""
-        if not is_block(data):
-            return
+    def _count_block(self, data: bytes) -> None:
+        """Count a block and its samples, and update the lag."""
         samples, arrival_s = peek_header(data)
-        self.blocks += 1
-        self.samples += samples
-        self.lag_s = max(self.lag_s or 0.0, time.time() - arrival_s)
-
-    def _add_dead_letter(self, letter: DeadLetter) -> None:
-        self.dead_letters += 1
-        self._results.queue_dead_letter(letter)
+        self._totals.blocks += 1
+        self._totals.samples += samples
+        self._totals.lag_s = max(self._totals.lag_s or 0.0, time.time() - arrival_s)

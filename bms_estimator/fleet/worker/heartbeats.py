@@ -18,11 +18,13 @@ from pathlib import Path
 
 from bms_estimator.edge.block import VERSION as BLOCK_VERSION
 from bms_estimator.fleet.heartbeat import DEAD_S, Heartbeat, RefusedPartition
+from bms_estimator.fleet.worker.block_runner import Totals
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, common_format, oldest_format
-from bms_estimator.fleet.worker.lease_tasks import LeaseTotals
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.version import __version__
 
+NOT_EVENTS = frozenset({"blocks", "samples"})
+"""Counters of a partition that are no events. The heartbeat has separate fields for them."""
 MAX_LISTED = 20
 """Maximum number of unknown packs, and of packs with a wrong clock, that a heartbeat names."""
 
@@ -32,14 +34,14 @@ class HeartbeatReport:
 
     Args:
         name: Name of the worker.
+        totals: Totals of the worker. The largest lag is reset with each heartbeat.
 
     Attributes:
         started_s: Wall clock at the worker's start [s since 1970].
-        totals: Totals over all leases since the start.
     """
 
-    def __init__(self, name: str) -> None:
-        self._name, self.started_s, self.totals = name, time.time(), LeaseTotals()
+    def __init__(self, name: str, totals: Totals) -> None:
+        self._name, self.started_s, self._totals = name, time.time(), totals
         # monotonic time since which blocks of a partition are unsaved, by lease and sequence number of its checkpoint
         self._unsaved_since: dict[tuple[PartitionLease, int], float] = {}
 
@@ -63,14 +65,15 @@ class HeartbeatReport:
             checkpoint_s: Duration of the last checkpoint [s].
             trouble: Description of the present error.
         """
-        self.totals.update(leases)
-        owned_leases = [lease for lease in leases if lease.is_owned]
-        counters, unknown, clock_errors = Counter[str](), list[str](), dict[str, float]()
+        totals, owned_leases = self._totals, [lease for lease in leases if lease.is_owned]
+        counters, events, unknown, clock_errors = Counter[str](), totals.events.copy(), list[str](), dict[str, float]()
         for lease in owned_leases:
             if lease.partition:
                 counters.update(lease.partition.counters)
+                events.update(lease.partition.events)
                 unknown += lease.partition.unknown
                 clock_errors |= lease.partition.clock_errors
+        lag_s, totals.lag_s = totals.lag_s, None
         usage = resource.getrusage(resource.RUSAGE_SELF)
         return Heartbeat(
             id=self._name,
@@ -83,9 +86,12 @@ class HeartbeatReport:
             leaving=leaving,
             partitions=tuple(lease.number for lease in owned_leases),
             packs=counters["packs"],
-            **self.totals.processed(),
-            events=self.totals.events(),
-            lag_s=_take_lag_s(owned_leases),
+            blocks=totals.blocks,
+            samples=totals.samples,
+            faults=totals.faults,
+            dead_letters=totals.dead_letters,
+            events={name: count for name, count in events.items() if name not in NOT_EVENTS},
+            lag_s=lag_s,
             counters=dict(counters),
             unknown_count=len(unknown),
             unknown=tuple(sorted(unknown)[:MAX_LISTED]),
@@ -96,7 +102,7 @@ class HeartbeatReport:
             unsaved_s=self._unsaved_s(owned_leases),
             checkpoint_s=checkpoint_s,
             cpu_s=usage.ru_utime + usage.ru_stime,
-            estimation_s=self.totals.estimation_s(),
+            estimation_s=totals.estimation_s,
             rss_mib=_rss_mib(),
             reconnects=reconnects,
             trouble=trouble,
@@ -111,14 +117,6 @@ class HeartbeatReport:
                 since[lease, saved] = self._unsaved_since.get((lease, saved), now_s)
         self._unsaved_since = since
         return now_s - min(since.values(), default=now_s)
-
-
-def _take_lag_s(leases: Sequence[PartitionLease]) -> float | None:
-    """Return the largest lag since the previous call [s]; None without a block."""
-    lags = [lease.runner.lag_s for lease in leases if lease.runner.lag_s is not None]
-    for lease in leases:
-        lease.runner.lag_s = None
-    return max(lags, default=None)
 
 
 def _rss_mib() -> float:
@@ -164,8 +162,7 @@ class Membership:
     def __init__(self, me: str) -> None:
         self.me = me
         self.refused: dict[int, int] = {}
-        self._last_heartbeat_s: dict[str, float] = {}
-        self._last_heartbeat: dict[str, Heartbeat] = {}
+        self._last: dict[str, tuple[float, Heartbeat]] = {}  # arrival and heartbeat of each other worker
         self._alive: dict[str, frozenset[int]] = {}
         self._share: set[int] = set()
 
@@ -175,15 +172,15 @@ class Membership:
         if worker == self.me:
             return False
         if heartbeat.leaving:
-            self._last_heartbeat_s.pop(worker, None)
+            self._last.pop(worker, None)
             return False
-        is_new = worker not in self._last_heartbeat_s
-        self._last_heartbeat_s[worker], self._last_heartbeat[worker] = now_s, heartbeat
+        is_new = worker not in self._last
+        self._last[worker] = now_s, heartbeat
         return is_new
 
     def extend_deadlines(self, now_s: float) -> None:
         """Extend the deadline of all workers after a time without a connection, in which no heartbeat could arrive."""
-        self._last_heartbeat_s = dict.fromkeys(self._last_heartbeat_s, now_s)
+        self._last = {worker: (now_s, heartbeat) for worker, (_, heartbeat) in self._last.items()}
 
     def checkpoint_format(self, now_s: float) -> int:
         """Return the format in which checkpoints are written, so that all live workers can read them."""
@@ -208,8 +205,5 @@ class Membership:
 
     def _others(self, now_s: float) -> dict[str, Heartbeat]:
         """Return the last heartbeat of each other live worker."""
-        self._last_heartbeat_s = {
-            worker: last_s for worker, last_s in self._last_heartbeat_s.items() if now_s - last_s < DEAD_S
-        }
-        self._last_heartbeat = {worker: self._last_heartbeat[worker] for worker in self._last_heartbeat_s}
-        return self._last_heartbeat
+        self._last = {worker: last for worker, last in self._last.items() if now_s - last[0] < DEAD_S}
+        return {worker: heartbeat for worker, (_, heartbeat) in self._last.items()}

@@ -1,12 +1,11 @@
-"""Leases of a worker: tasks that process their messages, periodic tasks over all leases, and totals since the start.
+"""Leases of a worker: tasks that process their messages, and periodic tasks over all leases.
 
 The periodic tasks store checkpoints and results, check for unsaved blocks, and report unknown packs.
 """
 
 import asyncio
 import time
-from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, KeysView, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, KeysView, Sequence
 
 import structlog
 from nats.aio.client import Client
@@ -20,71 +19,6 @@ from bms_estimator.process.runtime import end
 
 log = structlog.get_logger(__name__)
 
-NOT_EVENTS = frozenset({"blocks", "samples", "packs", "unknown"})
-"""Counters of a partition that are no events. The heartbeat has separate fields for them."""
-
-
-class SourceSum:
-    """Sum of the counters of sources that come and go. It still includes removed sources."""
-
-    def __init__(self) -> None:
-        self._former = Counter[str]()
-        self._present: Mapping[object, Counter[str]] = {}
-
-    def update(self, present: Mapping[object, Counter[str]]) -> None:
-        """Set the counters of the present sources."""
-        for source in self._present.keys() - present.keys():
-            self._former.update(self._present[source])
-        self._present = present
-
-    def total(self) -> Counter[str]:
-        """Return the sum over present and former sources."""
-        return sum(self._present.values(), self._former)
-
-
-class LeaseTotals:
-    """Totals over all leases of a worker since its start."""
-
-    def __init__(self) -> None:
-        self._counts, self._events = SourceSum(), SourceSum()
-
-    def update(self, leases: Iterable[PartitionLease]) -> None:
-        """Read the counters of the present leases. Call it before a lease is removed."""
-        self._counts.update({lease.runner: _run_counts(lease) for lease in leases})
-        self._events.update({lease.partition: _event_counts(lease) for lease in leases if lease.partition})
-
-    def processed(self) -> dict[str, int]:
-        """Return the numbers of blocks, samples, faults and dead letters."""
-        counts = self._counts.total()
-        return {name: counts[name] for name in ("blocks", "samples", "faults", "dead_letters")}
-
-    def estimation_s(self) -> float:
-        """Return the processor time of estimation [s]."""
-        return self._counts.total()["estimation_us"] / 1e6
-
-    def events(self) -> dict[str, int]:
-        """Return the numbers of events in this worker by name."""
-        return dict(self._events.total())
-
-
-def _run_counts(lease: PartitionLease) -> Counter[str]:
-    runner = lease.runner
-    return Counter(
-        blocks=runner.blocks,
-        samples=runner.samples,
-        faults=runner.faults,
-        dead_letters=runner.dead_letters,
-        estimation_us=round(1e6 * runner.budget.total_s),
-    )
-
-
-def _event_counts(lease: PartitionLease) -> Counter[str]:
-    if lease.partition is None:
-        return Counter()
-    new_counters = Counter(lease.partition.counters) - Counter(lease.restored_counters)
-    return Counter({name: count for name, count in new_counters.items() if name not in NOT_EVENTS})
-
-
 MAX_RELEASES = 8
 """Maximum number of partitions that are saved and released concurrently."""
 
@@ -93,12 +27,11 @@ class LeaseTasks:
     """Leases of a worker and their tasks. A lease is removed after its release.
 
     Args:
-        totals: Totals over all leases, updated before a lease is removed.
         is_connected: Returns True while the worker is connected. Without a connection, a lease ends without a release.
     """
 
-    def __init__(self, totals: LeaseTotals, is_connected: Callable[[], bool]) -> None:
-        self._totals, self._is_connected = totals, is_connected
+    def __init__(self, is_connected: Callable[[], bool]) -> None:
+        self._is_connected = is_connected
         self._leases: dict[int, PartitionLease] = {}
         self._tasks: dict[int, asyncio.Task[None]] = {}
         self._releases: dict[int, asyncio.Task[None]] = {}
@@ -148,7 +81,7 @@ class LeaseTasks:
         async with self._release_slots:
             if self._is_connected():
                 await self._leases[number].release()
-        self._totals.update(self.leases)
+        self._leases[number].drop()
         del self._leases[number], self._tasks[number], self._releases[number]
 
 
@@ -187,7 +120,7 @@ class PeriodicStorage:
     async def send_results(self, leases: Sequence[PartitionLease]) -> None:
         """Send the queued summaries and dead letters again."""
         for lease in leases:
-            if lease.results.is_waiting and self._nc.is_connected:
+            if lease.results.waiting and self._nc.is_connected:
                 await self._try(lease, lease.results.send_queued)
 
     async def _try(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import COMPARED, FitRequest, FitResult, Rows, RowsPosition, encode_rows
 from bms_estimator.fleet.packs.pack_type import Bytes, PackType, WorkerFit, bytes_of
-from bms_estimator.fleet.worker.block_result import QueuedMessage
+from bms_estimator.fleet.worker.block_result import QueuedMessage, stored_once
 from bms_estimator.fleet.worker.pack_state import PACK_FIT
 from bms_estimator.kernels.accumulators.history import MAX_ROWS, MIN_FREE_ROWS
 from bms_estimator.pack_model.bank_comparison import ComparedCell
@@ -164,10 +164,10 @@ class PackFits:
         rows = slow_fit.estimator.take_rows()
         position, identity = RowsPosition(self._sequence, len(self._messages)), f"{self._pack}.{self._sequence}"
         data = encode_rows(Rows(rows, position, self._digest))
-        self._messages.append(QueuedMessage(subjects.history(self._pack), data, f"{identity}.{position.part}"))
+        self._messages.append(stored_once(subjects.history(self._pack), data, f"{identity}.{position.part}"))
         if is_request:
             request = FitRequest(sequence=self._sequence, part=position.part).model_dump_json().encode()
-            self._messages.append(QueuedMessage(subjects.fit_request(self._pack), request, identity))
+            self._messages.append(stored_once(subjects.fit_request(self._pack), request, identity))
 
 
 def write_fit(record: np.void, result: FitResult, sequence: int) -> None:

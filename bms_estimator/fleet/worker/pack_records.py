@@ -79,16 +79,16 @@ def cell_count(layout: str) -> int:
     return cells if 0 < cells <= MAX_CELLS and cell_layout(cells) == layout else 0
 
 
-class CellPack(NamedTuple):
-    """Packed record of a pack with single cells.
+class PackRecord(NamedTuple):
+    """Packed record of a pack in this version's layout.
 
     Attributes:
-        cells: Number of single cells.
         packed: The packed record.
+        cells: Number of single cells; 0 without cell voltages.
     """
 
-    cells: int
     packed: bytes
+    cells: int = 0
 
 
 class PackRecords:
@@ -104,38 +104,35 @@ class PackRecords:
     def __init__(self, counters: Counter[str]) -> None:
         self.unpacked = UnpackedRecord()
         self._counters = counters
-        self._packs: dict[str, bytes] = {}  # packs without single cells
-        self._cell_packs: dict[str, CellPack] = {}
+        self._packs: dict[str, PackRecord] = {}
         self._unmigrated: dict[str, RecordWithLayout] = {}  # packs whose record has the layout of another version
         # delivery records of the unmigrated packs, updated since the partition was restored
         self._unmigrated_deliveries: dict[str, np.void] = {}
 
     def __len__(self) -> int:
-        return len(self._packs) + len(self._cell_packs) + len(self._unmigrated)
+        return len(self._packs) + len(self._unmigrated)
 
     def restore(self, packs: Mapping[str, bytes], other_layouts: Mapping[str, RecordWithLayout]) -> None:
         """Add the records of a checkpoint (``PartitionCheckpoint``)."""
-        self._packs.update(packs)
+        self._packs.update((pack, PackRecord(packed)) for pack, packed in packs.items())
         for pack, record in other_layouts.items():
             if cells := cell_count(record.layout):
-                self._cell_packs[pack] = CellPack(cells, record.packed)
+                self._packs[pack] = PackRecord(record.packed, cells)
             else:
                 self._unmigrated[pack] = record
 
     def snapshot(self) -> tuple[dict[str, bytes], dict[str, RecordWithLayout]]:
         """Return ``packs`` and ``other_layouts`` of a checkpoint. Records are not copied, because they are immutable bytes."""
         with_cells = {
-            pack: RecordWithLayout(cell_layout(cells), packed) for pack, (cells, packed) in self._cell_packs.items()
+            pack: RecordWithLayout(cell_layout(cells), packed) for pack, (packed, cells) in self._packs.items() if cells
         }
-        return dict(self._packs), self._unmigrated | with_cells
+        return {
+            pack: packed for pack, (packed, cells) in self._packs.items() if not cells
+        }, self._unmigrated | with_cells
 
     def is_current(self, pack: str) -> bool:
         """Return True if the pack has a record in this version's layout."""
-        return pack in self._packs or pack in self._cell_packs
-
-    def has_cells(self, pack: str) -> bool:
-        """Return True if the pack has a record with single cells, in this version's layout."""
-        return pack in self._cell_packs
+        return pack in self._packs
 
     def load(self, pack: str) -> Fields | None:
         """Load a pack into the unpacked record; a new pack has the initial record.
@@ -143,13 +140,9 @@ class PackRecords:
         Returns:
             The estimator fields by name if the estimator's part of the record has another layout; otherwise None.
         """
-        packed = self._packs.get(pack)
         try:
-            if packed is not None:
-                self.unpacked.load(packed)
-                return None
-            if (cell_pack := self._cell_packs.get(pack)) is not None:
-                self.unpacked.load(cell_pack.packed, cell_pack.cells)
+            if (record := self._packs.get(pack)) is not None:
+                self.unpacked.load(*record)
                 return None
             if (unmigrated := self._unmigrated.get(pack)) is not None:
                 estimator_fields = self.unpacked.load_previous_layout(dtype_of(unmigrated.layout), unmigrated.packed)
@@ -163,13 +156,7 @@ class PackRecords:
 
     def store(self, pack: str) -> None:
         """Store the unpacked record as the record of a pack."""
-        packed, cells = self.unpacked.packed_bytes(), self.unpacked.cell_count
-        if cells:
-            self._cell_packs[pack] = CellPack(cells, packed)
-            self._packs.pop(pack, None)
-        else:
-            self._packs[pack] = packed
-            self._cell_packs.pop(pack, None)
+        self._packs[pack] = PackRecord(self.unpacked.packed_bytes(), self.unpacked.cell_count)
         self._unmigrated.pop(pack, None)
         self._unmigrated_deliveries.pop(pack, None)
 

@@ -58,6 +58,7 @@ class Partition:
         sequence: Stream sequence number of the last processed or deferred message; 0: none.
         in_force: Table of packs that is in force at this position of the stream.
         deferred: Queue of packs with deferred messages.
+        events: Numbers of blocks, samples and events in this process by name.
         clock_errors: Errors of edges' clocks beyond the limits of ``block_order``, by pack [s], positive if ahead. A pack is
             listed from a block with an error until the end of this hour on its clock.
     """
@@ -71,9 +72,10 @@ class Partition:
         wall: Callable[[], float] = time.time,
     ) -> None:
         self.number, self.sequence = number, 0
-        self._counters: Counter[str] = Counter()
-        self._records = PackRecords(self._counters)
-        self._processor = BlockProcessor(self._records.unpacked, self._counters, wall)
+        self._former_events: Mapping[str, int] = {}  # in the processes before
+        self.events = Counter[str]()
+        self._records = PackRecords(self.events)
+        self._processor = BlockProcessor(self._records.unpacked, self.events, wall)
         self.in_force = TableInForce(table, sources, self._processor.types)
         self.deferred = Deferred()
         self.clock_errors: dict[str, float] = {}
@@ -102,7 +104,7 @@ class Partition:
         partition = cls(number, table, sources=sources, wall=wall)
         partition.in_force.restore(checkpoint.in_force)
         partition.sequence = checkpoint.sequence
-        partition._counters.update(checkpoint.counters)
+        partition._former_events = checkpoint.counters
         partition._records.restore(checkpoint.packs, checkpoint.other_layouts)
         partition.deferred = Deferred(checkpoint.deferred)
         return partition
@@ -113,7 +115,7 @@ class Partition:
         return PartitionCheckpoint(
             number=self.number,
             sequence=self.sequence,
-            counters=dict(self._counters),
+            counters=self._all_events(),
             packs=packs,
             other_layouts=other_layouts,
             deferred=self.deferred.spans(),
@@ -133,10 +135,14 @@ class Partition:
     def counters(self) -> Mapping[str, int]:
         """Counters since the creation of the partition, including those of former workers."""
         return {
-            **self._counters,
+            **self._all_events(),
             "packs": len(self._records),
             "unknown": len(self.unknown),
         }
+
+    def _all_events(self) -> dict[str, int]:
+        former = self._former_events
+        return {**former, **{name: former.get(name, 0) + count for name, count in self.events.items()}}
 
     @property
     def unknown(self) -> tuple[str, ...]:
@@ -152,10 +158,10 @@ class Partition:
 
     def cells(self, pack: str) -> NDArray[np.void]:
         """Return a copy of the states of a pack's single cells, shape (m,), dtype ``CELL``; m is 0 without any."""
-        if not self._records.has_cells(pack):
+        if not self._records.is_current(pack):
             return np.zeros(0, CELL)
         self._records.load(pack)
-        return self._records.unpacked.cells.copy()
+        return self._records.unpacked.cells.copy() if self._records.unpacked.cell_count else np.zeros(0, CELL)
 
     def process(
         self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
@@ -171,7 +177,7 @@ class Partition:
             is_lethal: Skip the block, because it has killed workers (``takeover``).
         """
         if sequence <= self.sequence:
-            self._counters["repeated"] += 1
+            self.events["repeated"] += 1
             return BlockResult(pack)
         if pack in self.deferred:
             return self.defer(pack, sequence)
@@ -189,10 +195,10 @@ class Partition:
         self.sequence = max(self.sequence, sequence)
         if pack in self.deferred or len(self.deferred) < MAX_DEFERRED_PACKS or self.in_force.is_known(pack):
             self.deferred.add(pack, sequence)
-            self._counters["deferred"] += 1
+            self.events["deferred"] += 1
         else:
-            self._counters["not_deferred"] += 1
-        return BlockResult(pack)
+            self.events["not_deferred"] += 1
+        return BlockResult(pack, is_deferred=True)
 
     def process_deferred(
         self, pack: str, data: bytes, sequence: int, received_s: int | None = None, *, is_lethal: bool = False
@@ -200,7 +206,7 @@ class Partition:
         """Process the next deferred message of a known pack. ``process`` describes the arguments."""
         pack_type = self.in_force.look_up(pack)
         if pack_type is None or pack not in self.deferred:
-            return BlockResult(pack)
+            return BlockResult(pack, is_deferred=True)
         self.deferred.advance(pack, sequence)
         if is_change(data):
             return self._apply_change(pack, data)
@@ -210,7 +216,7 @@ class Partition:
         """Skip and count a message of a pack that belongs to another partition."""
         if sequence > self.sequence:
             self.sequence = sequence
-            self._counters["misplaced"] += 1
+            self.events["misplaced"] += 1
             self._log_rejection(pack, "the pack belongs to another partition")
         return BlockResult(pack)
 
@@ -219,9 +225,9 @@ class Partition:
         try:
             self.in_force.apply_change(pack, data)
         except ValueError:
-            self._counters["damaged"] += 1
+            self.events["damaged"] += 1
         else:
-            self._counters["table_changes"] += 1
+            self.events["table_changes"] += 1
         return BlockResult(pack)
 
     def _receive_fit(self, pack: str, data: bytes, sequence: int, pack_type: PackType) -> BlockResult:
@@ -230,14 +236,14 @@ class Partition:
         try:
             result = decode_result(data)
         except ValueError:
-            self._counters["damaged"] += 1
+            self.events["damaged"] += 1
             return BlockResult(pack)
         if records.is_current(pack) and records.load(pack) is None:
             if self._processor.receive_fit(result, sequence, pack_type):
                 self._unsaved.add(pack, position(records.unpacked.delivery))
                 records.store(pack)
             else:
-                self._counters["stale_fits"] += 1
+                self.events["stale_fits"] += 1
         return BlockResult(pack)
 
     def _process_fit_or_block(
@@ -257,7 +263,7 @@ class Partition:
         try:
             return decode_block(data)
         except BlockError as error:
-            self._counters["damaged"] += 1
+            self.events["damaged"] += 1
             return error
 
     def _process_block(self, pack: str, block: BlockHeader, arrival: Arrival, pack_type: PackType) -> BlockResult:
@@ -275,9 +281,9 @@ class Partition:
             result = self._process_next(pack, block, arrival, pack_type, unmigrated_fields, newly_lost)
         else:
             result = BlockResult(pack)
-            self._counters[order.value] += 1
+            self.events[order.value] += 1
         if order is BlockOrder.NEXT or unmigrated_fields is None:
-            self._counters["lost_blocks"] += newly_lost
+            self.events["lost_blocks"] += newly_lost
             records.store(pack)
         else:
             records.store_unmigrated_delivery(pack)
@@ -323,7 +329,7 @@ class Partition:
             records.load_unmigrated_delivery(pack)
             classify_block(delivery, block)
             records.unpacked.count_lost(newly_lost)
-            self._counters[skip_counter] += 1
+            self.events[skip_counter] += 1
         mark_processed(delivery)
         self._update_clock_error(pack, float(delivery["clock_error_s"]))
         return result

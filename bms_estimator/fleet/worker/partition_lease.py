@@ -3,11 +3,15 @@
 The state depends only on the order of the stream. Therefore the sequence number of the last processed message defines the state.
 Messages that were delivered to another worker, or lost in transit, are read from the stream. The stream is also read after
 some time without a delivery, because the server does not redeliver messages that it delivered to a worker that has died.
+
+Messages that need no request to the server are processed by the block loop. The task of the lease does everything else: it catches
+up with the stream, processes deferred messages one by one, and sends changes of the table of packs. During the last two, the
+block loop continues.
 """
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable
 from contextlib import aclosing
 from functools import partial
 
@@ -15,20 +19,20 @@ import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 
+from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo
 from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.worker.block_loop import SILENCE_S, BlockLoop, DeliveredMessages
 from bms_estimator.fleet.worker.block_result import BlockResult, ResultPublisher, merge
-from bms_estimator.fleet.worker.block_runner import BlockRunner
+from bms_estimator.fleet.worker.block_runner import BlockRunner, Totals
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
+from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.fleet.worker.partition_tasks import DeferredReader, TableChangeSender
 from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer, RawMessages
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 from bms_estimator.fleet.worker.takeover import ReplayGuard, restore_partition
-from bms_estimator.process.runtime import until_first_ends
 
 IDLE_SILENCE_S = 5.0 * SILENCE_S
 """Interval between two searches while the stream has no further messages [s]."""
@@ -54,11 +58,11 @@ class PartitionLease:
         is_busy: Returns True while any partition of the worker has received messages that are not processed.
 
     Attributes:
+        totals: Totals of the worker; updated.
         consumer: Consumer of the messages.
         results: Publisher of the results.
-        runner: Runner of the messages, with the counters of this lease.
+        runner: Runner of the messages.
         partition: State of the packs; None while the partition is not taken over.
-        restored_counters: Counters of the partition at its claim.
         claim: Claim of this worker; None while it has none.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
@@ -74,6 +78,7 @@ class PartitionLease:
         checkpoints: CheckpointStore,
         inbox: str,
         block_loop: BlockLoop,
+        totals: Totals,
         *,
         partitions: int,
         checkpoint_format: Callable[[], int],
@@ -82,9 +87,9 @@ class PartitionLease:
     ) -> None:
         self.number, self._table, self._sources = number, table, sources
         self._checkpoints, self._checkpoint_format, self._block_loop = checkpoints, checkpoint_format, block_loop
-        self._messages = RawMessages(nc, number)
+        self.totals = totals
+        self._js, self._messages, self._is_busy = nc.jetstream(), RawMessages(nc, number), is_busy
         self._guard = ReplayGuard(checkpoints.replays, number)
-        self._changes = TableChangeSender(nc, lambda: self.partition, self._try)
         self.results = ResultPublisher(nc)
         self.runner = BlockRunner(
             number,
@@ -93,16 +98,11 @@ class PartitionLease:
             block_loop.step_lock,
             self._guard,
             self.results,
+            totals,
             save=self.save,
-            on_table_change=self._changes.add,
-            on_deferred=lambda: self._deferred.wake_up(),  # noqa: PLW0108 - created below
-        )
-        self._deferred = DeferredReader(
-            nc, lambda: self.partition, self.runner, self.results, is_busy=is_busy, attempt=self._try
         )
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
-        self.restored_counters: Mapping[str, int] = {}
         self.claim: Claim | None = None
         self.trouble, self.checkpoint_due_s = "", 0.0
         self.refused_format: int | None = None
@@ -110,6 +110,8 @@ class PartitionLease:
             self.consumer, self._guard, self.results, block_loop, self._process_next, self._try
         )
         self._is_search_due = False  # True: the stream must be searched, because no message has arrived
+        self._are_changes_due = False  # True: changed rows of the table must be sent
+        self._replay_end = 0  # stream sequence number of the last message at the takeover
         self._state_lock = asyncio.Lock()  # held while ``partition`` and ``claim`` change
 
     @property
@@ -139,18 +141,12 @@ class PartitionLease:
 
         The caller calls this method about once a second.
         """
-        if time.monotonic() >= self._delivered.next_search_s:
-            self._is_search_due = True
-            self._delivered.wake_up()
-        self._deferred.wake_up()
-        self._changes.wake_up()
+        self._is_search_due |= time.monotonic() >= self._delivered.next_search_s
+        self._are_changes_due = True
+        self._delivered.wake_up()
 
     async def run(self) -> None:
-        """Process messages until cancelled."""
-        await until_first_ends(self._process_messages(), self._deferred.run(), self._changes.run())
-
-    async def _process_messages(self) -> None:
-        """Process the messages that need requests to the server; leave the others to the block loop."""
+        """Process the messages that need requests to the server until cancelled; leave the others to the block loop."""
         delivered = self._delivered
         while True:
             delivered.begin_pass()
@@ -164,6 +160,14 @@ class PartitionLease:
                 self._is_search_due = False
                 delivered.postpone_search()
                 await self._try(self._read_undelivered)
+            elif self._are_changes_due:
+                self._are_changes_due = False
+                with delivered.served():
+                    await self._try(self._send_table_changes)
+            elif (partition := self.partition) and (due := partition.deferred.next(self._is_due)):
+                with delivered.served():
+                    if not await self._try(partial(self._process_deferred, partition, *due)):
+                        await asyncio.sleep(RETRY_S)
             else:
                 await delivered.wait()
 
@@ -224,13 +228,18 @@ class PartitionLease:
                 reason=error_text(error),
             )
 
+    def drop(self) -> None:
+        """Drop state and claim, and add the events in the partition to the totals of the worker."""
+        if self.partition:
+            self.totals.events.update(self.partition.events)
+        self.partition = self.claim = None
+
     def on_settings_changed(self, pack: str) -> None:
         """Handle a changed or new row of the table of packs."""
         if self.partition:
-            if pack not in self.partition.in_force.rows:  # a row in force changes only by a message of the stream
-                self.partition.in_force.forget_type(pack)
-            self._changes.add(pack)
-            self._deferred.wake_up()
+            self.partition.in_force.on_table_changed(pack)
+            self._are_changes_due = True
+            self._delivered.wake_up()
 
     async def _process_delivered(self, delivered: DeliveredMessage) -> None:
         """Process the stream up to a delivered message. Return without it if the pin is lost."""
@@ -249,7 +258,7 @@ class PartitionLease:
             self._delivered.pin = delivered.pin
         # guarded messages are read together, because a request for one of them also returns the following ones
         self._delivered.is_caught_up = await self._catch_up(
-            partition, max(delivered.sequence, self._guard.end_sequence)
+            partition, max(delivered.message.sequence, self._guard.end_sequence)
         )
 
     async def _read_undelivered(self) -> None:
@@ -259,7 +268,7 @@ class PartitionLease:
             return
         async with self._state_lock:
             partition = await self._take_over()
-        if await self._messages.has_later(partition.sequence):
+        if await self._messages.next(partition.sequence + 1):
             await self._catch_up(partition, await self._messages.last_sequence())
         else:
             self._delivered.postpone_search(IDLE_SILENCE_S)
@@ -271,11 +280,9 @@ class PartitionLease:
         if partition is None:
             claim = await self._checkpoints.claim(self.number)
             partition = await restore_partition(self._checkpoints, claim, self.number, self._table, self._sources)
-            replay_end = await self._messages.last_sequence()
-            await self._guard.begin(claim, replay_end)
-            self.partition, self.claim, self.restored_counters = partition, claim, partition.counters
-            self._changes.begin(partition.in_force.rows, replay_end)
-            self._deferred.wake_up()
+            self._replay_end = await self._messages.last_sequence()
+            await self._guard.begin(claim, self._replay_end)
+            self.partition, self.claim = partition, claim
         last_sequence = await self._messages.last_of_all_partitions()
         if self._guard.end_sequence > last_sequence:  # the server has since lost the replayed stream
             self._guard.end_sequence = 0
@@ -299,10 +306,11 @@ class PartitionLease:
             return True
         latest: dict[str, BlockResult] = {}
         async with aclosing(self._messages.read(partition.sequence + 1, sequence)) as messages:
-            async for pack, message in messages:
+            async for message in messages:
                 if self._delivered.pin_lapsed or self.partition is not partition:
                     break
-                latest[pack] = merge(latest.get(pack), await self.runner.process(partition, pack, message))
+                result = await self.runner.process(partition, message)
+                latest[message.pack] = merge(latest.get(message.pack), result)
         for result in latest.values() if self.partition is partition else ():
             await self.results.publish(result)
         return self.partition is partition and not self._delivered.pin_lapsed
@@ -310,8 +318,36 @@ class PartitionLease:
     def _process_next(self, delivered: DeliveredMessage) -> None:
         """Process a delivered message whose predecessors are all processed."""
         partition = self.partition
-        if partition is not None and delivered.sequence > partition.sequence:
-            self.results.add(self.runner.process_unguarded(partition, delivered.pack, delivered))
+        if partition is not None and delivered.message.sequence > partition.sequence:
+            self.results.add(self.runner.process_unguarded(partition, delivered.message))
+
+    def _is_due(self, pack: str) -> bool:
+        """Return True if a deferred pack is known, and is within its budget or no other pack needs the processor."""
+        is_known = self.partition is not None and self.partition.in_force.is_known(pack)
+        return is_known and not (self.runner.budget.is_exhausted(pack) and self._is_busy())
+
+    async def _process_deferred(self, partition: Partition, pack: str, span: Span) -> None:
+        """Process the next deferred message of a pack."""
+        message = await self._messages.next(span.first, pack)
+        if message is None or message.sequence > span.last:
+            # the stream has dropped the messages; the reply to the edge's next block requests them again
+            partition.deferred.advance(pack, span.last)
+        else:
+            await self.results.publish(await self.runner.process_deferred(partition, message))
+
+    async def _send_table_changes(self) -> None:
+        """Send the rows of the table that differ from those in force to the stream.
+
+        Nothing is sent before the end of the replay, because the replay contains the changes that the former owner has sent.
+        """
+        partition = self.partition
+        if partition is None or partition.sequence < self._replay_end:
+            return
+        for pack in list(partition.in_force.unchecked):
+            change = partition.in_force.table_change(pack)
+            if change is not None:
+                await self._js.publish(subjects.table_change(pack), change)
+            partition.in_force.unchecked.discard(pack)
 
     async def _check_ownership(self) -> None:
         """Check the ownership after the pin has lapsed."""
@@ -336,7 +372,7 @@ class PartitionLease:
     def _drop_ownership(self, error: Exception) -> None:
         """Drop state and claim, because another worker has claimed the partition."""
         log.warning("fenced out: another worker has taken the partition over", partition=self.number, worker=str(error))
-        self.partition = self.claim = None
+        self.drop()
         self._delivered.reset()
         self.results.clear()  # the owner of the partition computes them from the last checkpoint on
 

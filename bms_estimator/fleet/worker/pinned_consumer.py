@@ -19,7 +19,7 @@ from nats.js.errors import NotFoundError
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import is_fit
 from bms_estimator.fleet.nats.stored_messages import read_messages
-from bms_estimator.fleet.nats.stream_reader import StoredMessage, StreamError
+from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import PIN_S, PRIORITY_GROUP, RESPONSE_TIMEOUT_S, consumer
 from bms_estimator.fleet.packs.table_change import is_change
 
@@ -29,16 +29,23 @@ def is_block(data: bytes) -> bool:
     return not (is_change(data) or is_fit(data))
 
 
-def discard_forged_data(subject: str, data: bytes) -> bytes:
-    """Return the data of a stored message, or empty data if an edge has sent anything else in place of a block.
+class RawMessage(NamedTuple):
+    """Message of a partition."""
 
-    Only workers send changes of the table, and only ``fleet fit`` sends fits. Empty data are rejected as a damaged block.
+    pack: str
+    data: bytes
+    """Empty if an edge has sent anything else in place of a block. Only workers send changes of the table, and only
+    ``fleet fit`` sends fits. Empty data are rejected as a damaged block."""
+    sequence: int
+    """Sequence number in the stream."""
+    received_s: int | None
+    """Server's clock at the arrival of the message [s since 1970]; None: unknown."""
 
-    Args:
-        subject: Subject under which the stream ``RAW`` stores the message.
-        data: Data of the message.
-    """
-    return b"" if subjects.is_raw(subject) and not is_block(data) else data
+
+def raw_message(subject: str, data: bytes, sequence: int, received_s: int | None) -> RawMessage:
+    """Return a message that the stream ``RAW`` stores under a subject."""
+    is_forged = subjects.is_raw(subject) and not is_block(data)
+    return RawMessage(subject.rpartition(".")[2], b"" if is_forged else data, sequence, received_s)
 
 
 class RawMessages:
@@ -50,7 +57,7 @@ class RawMessages:
     """
 
     def __init__(self, nc: Client, partition: int) -> None:
-        self._nc, self._js = nc, nc.jetstream()
+        self._nc, self._js, self._partition = nc, nc.jetstream(), partition
         self._subject = subjects.stored(partition)
 
     async def last_sequence(self) -> int:
@@ -64,16 +71,23 @@ class RawMessages:
         """Return the stream sequence number of the last message of all partitions."""
         return (await self._js.stream_info(subjects.RAW_STREAM)).state.last_seq
 
-    async def has_later(self, sequence: int) -> bool:
-        """Return True if the partition has a message with a larger stream sequence number."""
-        try:
-            await self._js.get_msg(subjects.RAW_STREAM, sequence + 1, self._subject, next=True)
-        except NotFoundError:
-            return False
-        return True
+    async def next(self, first: int, pack: str = "*") -> RawMessage | None:
+        """Return the first message from a stream sequence number on; None without one.
 
-    async def read(self, first: int, last: int) -> AsyncGenerator[tuple[str, StoredMessage], None]:
-        """Yield the messages in the order of the stream, each with the name of its pack.
+        Args:
+            first: Stream sequence number.
+            pack: Name of the pack whose messages are searched; default: all packs.
+        """
+        subject = subjects.stored(self._partition, pack)
+        try:
+            found = await self._js.get_msg(subjects.RAW_STREAM, first, subject, next=True)
+        except NotFoundError:
+            return None
+        received_s = int(found.time.timestamp()) if found.time else None
+        return raw_message(found.subject or "", found.data or b"", found.seq or 0, received_s)
+
+    async def read(self, first: int, last: int) -> AsyncGenerator[RawMessage, None]:
+        """Yield the messages in the order of the stream.
 
         Args:
             first: Stream sequence number at which the reading begins.
@@ -81,8 +95,7 @@ class RawMessages:
         """
         async with aclosing(read_messages(self._nc, subjects.RAW_STREAM, self._subject, first, last)) as messages:
             async for message in messages:
-                pack = message.subject.rpartition(".")[2]
-                yield pack, message._replace(data=discard_forged_data(message.subject, message.data))
+                yield raw_message(message.subject, message.data, message.sequence, message.received_s)
 
 
 RENEW_S = PIN_S / 4.0
@@ -97,20 +110,12 @@ STATUS_HEADER = "Status"
 """Header of a response without a message."""
 WRONG_PIN = "423"
 """Status of a request with an expired pin."""
-EXPECTED_STATUSES = frozenset({"404", "408", "409"})
-"""Statuses of a request that ended without messages, by its expiry or by a change of the consumer's leader. They need no
-action, because the next request follows."""
 
 
 class DeliveredMessage(NamedTuple):
-    """Message of the stream, delivered to this worker."""
+    """Message of the partition, delivered to this worker."""
 
-    pack: str
-    data: bytes
-    sequence: int
-    """Sequence number in the stream."""
-    received_s: int
-    """Server's clock at the arrival of the message [s since 1970]."""
+    message: RawMessage
     pin: int
     """Number of the pin under which this worker received the message, from 1."""
     follows: bool
@@ -127,7 +132,6 @@ class PinnedConsumer:
 
     Attributes:
         waiting: Queued messages.
-        trouble: Error of the last request; empty without one.
     """
 
     def __init__(self, nc: Client, partition: int, inbox: str) -> None:
@@ -136,7 +140,6 @@ class PinnedConsumer:
         self._info_subject = f"$JS.API.CONSUMER.INFO.{subjects.RAW_STREAM}.{consumer(partition)}"
         self._unpin_subject = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
         self.waiting: deque[DeliveredMessage] = deque()
-        self.trouble = ""
         self._pin = ""
         self._pin_count = 0
         self._last_consumer_sequence = -1  # of the last message; initially a value that no message follows
@@ -185,13 +188,9 @@ class PinnedConsumer:
         if status is None:
             self._queue_message(message, headers.get(PIN_HEADER, ""))
             return False
-        if status != WRONG_PIN:
-            self.trouble = (
-                "" if status in EXPECTED_STATUSES else f"status {status} {headers.get('Description', '')}".strip()
-            )
-            return False
-        # a status may still answer a request under an earlier pin
-        is_pin_lost = self.has_pin and message.subject.rpartition(".")[2] == str(self._pin_count)
+        # after any other status the next request follows; a status may still answer a request under an earlier pin
+        is_of_present_pin = self.has_pin and message.subject.rpartition(".")[2] == str(self._pin_count)
+        is_pin_lost = status == WRONG_PIN and is_of_present_pin
         if is_pin_lost:
             self._pin = ""
             self.waiting.clear()  # the server delivers them again to the next pinned worker
@@ -215,14 +214,10 @@ class PinnedConsumer:
         position = parse_position(message.reply)
         if pin != self._pin:
             self._pin, self._pin_count = pin, self._pin_count + 1
-        self.trouble = ""
         follows = position.consumer_sequence == self._last_consumer_sequence + 1
         self._last_consumer_sequence = position.consumer_sequence
-        pack = message.subject.rpartition(".")[2]
-        data = discard_forged_data(message.subject, message.data)
-        self.waiting.append(
-            DeliveredMessage(pack, data, position.stream_sequence, position.received_s, self._pin_count, follows)
-        )
+        raw = raw_message(message.subject, message.data, position.stream_sequence, position.received_s)
+        self.waiting.append(DeliveredMessage(raw, self._pin_count, follows))
 
 
 class MessagePosition(NamedTuple):

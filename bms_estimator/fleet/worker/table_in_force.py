@@ -34,11 +34,15 @@ class TableInForce:
         sources: Rows of the same table, whose changes are applied in the order of the stream; None: a change takes effect
             at once.
         types: Types of the packs of the partition.
+
+    Attributes:
+        unchecked: Packs whose rows in the table may differ from those in force.
     """
 
     def __init__(self, table: PackLookup, sources: PackSources | None, types: PackTypes) -> None:
         self._table, self._sources = table, sources
         self._rows: dict[str, PackSource] = {}  # of each pack with processed blocks
+        self.unchecked = set[str]()
         self._type_by_pack: dict[str, PackType] = {}
         self._types = types
 
@@ -48,8 +52,9 @@ class TableInForce:
         return self._rows
 
     def restore(self, rows: Mapping[str, PackSource]) -> None:
-        """Add the rows of a checkpoint."""
+        """Add the rows of a checkpoint. They are checked, because the former owner may not have sent the last changes."""
         self._rows.update(rows)
+        self.unchecked.update(rows)
 
     def look_up(self, pack: str) -> PackType | None:
         """Return the type of a pack; None if the pack is unknown. The present row of a new pack becomes the one in force."""
@@ -68,9 +73,11 @@ class TableInForce:
         """Return True if the pack has valid settings."""
         return self._settings(pack) is not None
 
-    def forget_type(self, pack: str) -> None:
-        """Drop the cached type of a pack, so that its next block looks it up again."""
-        self._type_by_pack.pop(pack, None)
+    def on_table_changed(self, pack: str) -> None:
+        """Check a changed or new row of the table. The row in force changes only by a message of the stream."""
+        if pack not in self._rows:
+            self._type_by_pack.pop(pack, None)
+        self.unchecked.add(pack)
 
     def table_change(self, pack: str) -> bytes | None:
         """Return the message for the stream if the row of a pack in the table differs from the one in force; otherwise None."""
@@ -90,7 +97,8 @@ class TableInForce:
             self._rows.pop(pack, None)
         else:
             self._rows[pack] = source
-        self.forget_type(pack)
+        self._type_by_pack.pop(pack, None)
+        self.unchecked.add(pack)  # a later change may still have to be sent
 
     def _settings(self, pack: str) -> tuple[Settings, PackModel] | None:
         """Return the settings and the model in force. For a new pack, and for a row with an error, the table is read."""

@@ -19,6 +19,7 @@ from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, close
 from bms_estimator.fleet.nats.streams import require_partitions
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.block_loop import BlockLoop
+from bms_estimator.fleet.worker.block_runner import Totals
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
 from bms_estimator.fleet.worker.heartbeats import HeartbeatReport, Membership
@@ -160,8 +161,9 @@ class Worker:
         self._leaving = False
         self._block_loop = BlockLoop()
         self._unknown = UnknownPacks(nc, self._bucket.packs)
-        self._report = HeartbeatReport(options.name)
-        self._lease_tasks = LeaseTasks(self._report.totals, lambda: nc.is_connected)
+        self._totals = Totals()
+        self._report = HeartbeatReport(options.name, self._totals)
+        self._lease_tasks = LeaseTasks(lambda: nc.is_connected)
         self._storage = PeriodicStorage(nc, options.checkpoint_s, self._partitions)
         self._unsaved = UnsavedCheck(nc)
 
@@ -299,6 +301,7 @@ class Worker:
             self._checkpoints,
             self._inbox,
             self._block_loop,
+            self._totals,
             partitions=self._partitions,
             checkpoint_format=lambda: self._members.checkpoint_format(time.monotonic()),
             sources=self._bucket.packs,

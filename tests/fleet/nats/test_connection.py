@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.fleet.nats import connection
-from bms_estimator.fleet.nats.connection import close, connect
+from bms_estimator.fleet.nats.connection import close, connect, run_connected
 from bms_estimator.fleet.server.nats_config import Tls
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 from tests.fleet.nats_cluster import running
 from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
@@ -117,3 +117,10 @@ async def _publish(nc, total_bytes: int) -> None:
     message = bytes(1 << 16)
     for _ in range(total_bytes // len(message)):
         await nc.publish("a.b", message)
+
+
+async def test_service_that_is_stopped_before_a_server_is_found_ends() -> None:
+    stop = asyncio.Event()
+    asyncio.get_running_loop().call_soon(stop.set)
+    async with asyncio.timeout(LONG_S):
+        await run_connected(close, stop, "w", ("nats://127.0.0.1:1", None, None))

@@ -7,8 +7,8 @@ import pytest
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
 from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters
-from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.table_change import PackSource, encode_change
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT, PartitionCheckpoint, read_checkpoint
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore

@@ -12,7 +12,6 @@ from bms_estimator.fleet.page.packs import MAX_LISTED, OTHER, SILENT_S, UNLISTED
 from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.model.input_faults import InputFault
 from tests.fleet.published_states import HOME, make_packs, state
-from tests.fleet.workers import OLD_HEARTBEAT
 from tests.sinks.snapshots import CELL_SNAPSHOT
 
 
@@ -35,7 +34,7 @@ def test_pack_that_never_sent_a_state_or_none_within_three_minutes_is_silent():
     packs.set_type("c", "lfp 16s1p")
     packs.receive_state("b", healthy(), 100.0)
     overview = packs.overview(100.0 + SILENT_S - 1.0, 0.0)
-    assert overview["packs"] == {"known": 3, "alive": 1, "silent": 2, "unlisted": 0, "uncertain": 0}
+    assert overview["packs"] == {"known": 3, "alive": 1, "silent": 2, "uncertain": 0}
     assert overview["concerns"]["silent"]["packs"] == [["c", None], ["a", 279.0]]
     assert overview["attention_count"] == 2
 
@@ -54,7 +53,7 @@ def test_pack_outside_the_table_counts_after_its_first_state_and_a_removed_pack_
     packs.set_type("a", "lfp 16s1p")
     packs.set_type("a", None)
     overview = packs.overview(1.0, 0.0)
-    assert overview["packs"] == {"known": 1, "alive": 1, "silent": 0, "unlisted": 1, "uncertain": 0}
+    assert overview["packs"] == {"known": 1, "alive": 1, "silent": 0, "uncertain": 0}
     assert [t["type"] for t in overview["types"]] == [UNLISTED]
 
 
@@ -149,12 +148,11 @@ def test_details_of_a_pack_have_its_state_parameters_and_suspected_faults():
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"[]", b"1", b'{"soc": NaN}', b"\xff", b"[" * 60_000])
-def test_invalid_messages_are_counted_and_skipped(data: bytes) -> None:
+def test_invalid_messages_are_skipped(data: bytes) -> None:
     packs = FleetPacks()
     packs.receive_state("a", data, 0.0)
     packs.receive_hour_summary("a", data)
     packs.receive_parameters("b", data)
-    assert packs.damaged == 1  # counts states only
     assert packs.overview(0.0, 0.0)["packs"]["known"] == 0
     assert packs.details("b", 0.0)["parameters"] is None
 
@@ -206,14 +204,14 @@ def test_rates_of_a_worker_are_those_of_the_last_seconds_and_unknown_after_its_r
     for second in range(30):
         seconds_at_10_blocks = max(second - 15, 0)  # at first one block a second
         workers.receive(
-            heartbeat("a", 0, blocks=second + 9 * seconds_at_10_blocks, samples=60 * second, cpu_s=0.5 * second),
+            heartbeat("a", 0, blocks=second, samples=60 * (second + 9 * seconds_at_10_blocks)),
             float(second),
         )
     (row,) = workers.overview(29.0)["workers"]
-    assert (row["blocks_per_s"], row["samples_per_s"], row["cpu"]) == (10.0, 60.0, 0.5)
-    workers.receive(heartbeat("a", 0, blocks=1), 30.0)
+    assert row["samples_per_s"] == 600.0
+    workers.receive(heartbeat("a", 0, blocks=1, samples=60), 30.0)
     (row,) = workers.overview(30.0)["workers"]
-    assert row["blocks_per_s"] is None
+    assert row["samples_per_s"] is None
 
 
 def test_unknown_packs_are_listed_until_they_are_known_or_no_worker_has_any():
@@ -249,12 +247,11 @@ def test_rate_of_received_states_is_measured():
     assert overview["states_per_s"] == 5.0
 
 
-def test_invalid_heartbeats_are_counted_and_skipped():
+def test_invalid_heartbeats_are_skipped():
     view = FleetView(1, 0.0)
     view.receive_worker(b"{}", 0.0)
     view.receive_worker(heartbeat("w", 0).model_dump_json().encode().replace(b"0.0", b"NaN"), 0.0)
-    view.overview_json(0.0, 0.0)  # raises no error, because the NaN was rejected
-    assert view.overview(0.0, 0.0)["damaged"] == 2
+    assert json.loads(view.overview_json(0.0, 0.0))["workers"] == []
 
 
 def test_new_connection_clears_workers_but_not_packs():
@@ -264,20 +261,10 @@ def test_new_connection_clears_workers_but_not_packs():
     view.set_connected(1000.0)
     overview = view.overview(1001.0, 0.0)
     assert overview["workers"] == []
-    assert overview["packs"] == {"known": 1, "alive": 0, "silent": 0, "unlisted": 1, "uncertain": 0}
+    assert overview["packs"] == {"known": 1, "alive": 0, "silent": 0, "uncertain": 0}
     assert overview["listening_s"] == 1.0
 
 
 def test_type_name_has_cell_layout_and_capacity():
     assert type_name(HOME) == "lfp 16s1p 280 Ah"
     assert type_name("series: must be above 0") == "wrong rows"  # a row with an error is replaced by its text
-
-
-def test_worker_of_a_version_without_formats_and_dead_letters_is_listed():
-    view = FleetView(2, 0.0)
-    view.receive_worker(json.dumps(OLD_HEARTBEAT).encode(), 0.0)
-    overview = view.overview(0.0, 0.0)
-    (worker,) = overview["workers"]
-    assert (worker["id"], worker["checkpoint_formats"], worker["refused"]) == ("old", [1, 1], [])
-    assert (overview["holders"], overview["refused"], overview["damaged"]) == ([0, 0], [], 0)
-    assert (overview["concerns"]["dead"]["count"], overview["concerns"]["clock"]["count"]) == (0, 0)

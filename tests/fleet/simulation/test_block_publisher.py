@@ -79,21 +79,17 @@ def test_every_block_reaches_the_stream_and_a_requested_block_arrives_again(tmp_
     assert report.repeated >= 1
 
 
-def test_command_writes_table_and_truth_and_rejects_invalid_options(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_command_writes_table_and_rejects_invalid_options(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     simulate = ("fleet", "simulate", "--packs", 4)
-    table, truth = tmp_path / "packs.csv", tmp_path / "truth.csv"
-    assert run(capsys, *simulate, "--table", table, "--truth", truth)[0] == 0
+    table = tmp_path / "packs.csv"
+    assert run(capsys, *simulate, "--table", table)[0] == 0
     rows = table.read_text().splitlines()
     assert rows[0].startswith("pack,cell,capacity_ah,series,parallel")
     assert rows[1:3] == ["sim-000000,lfp,100.0,16,1,0.01,0.1,1", "sim-000001,nmc,10.0,14,2,0.01,0.05,1"]
-    assert len(truth.read_text().splitlines()) == 5
     for arguments, message in (
         ((), "--mqtt mqtt://host:port"),
         (("--mqtt", "http://nowhere"), "--mqtt http://nowhere"),
         (("--table", tmp_path / "no" / "packs.csv"), "cannot be written"),
-        (("--prefix", "a b", "--table", table), "--prefix a b: must consist of letters, digits, _ and -"),
     ):
         code, _, err = run(capsys, *simulate, *arguments)
         assert (code, message in err) == (2, True), err

@@ -58,7 +58,7 @@ class FittedStream(Stream):
         self.hours += [Hour.model_validate_json(row) for _, row in result.hours]
         for message in result.history:
             if message.subject == subjects.history(pack):
-                self.history.setdefault(message.message_id, message.data)  # the server drops repetitions
+                self.history.setdefault(message.headers["Nats-Msg-Id"], message.data)  # the server drops repetitions
             else:
                 self.requests.append(FitRequest.model_validate_json(message.data))
         return result
@@ -134,7 +134,7 @@ def test_changed_cell_discards_the_fit_and_its_history(samples) -> None:
     assert stream.partition.counters["fits"]
     other = CELL.model_copy(update={"cell": CELL.cell.model_copy(update={"capacity_ah": 3.3})})
     stream.partition.in_force._table = lambda _: (SETTINGS, other)
-    stream.partition.in_force.forget_type(PACK)
+    stream.partition.in_force.on_table_changed(PACK)
     stream.send_all(blocks[400:401])
     record = stream.partition.state(PACK)
     assert record["fit"]["in_force"]["sequence"] == 0

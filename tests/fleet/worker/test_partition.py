@@ -452,7 +452,7 @@ class TestChangedSettings:
         self.send_blocks(stream, samples, 0, 20)
         other_cell = load_cell("ncr18650", 4.0)  # a capacity of 4 Ah
         packs["a"] = SETTINGS, other_cell
-        stream.partition.in_force.forget_type("a")
+        stream.partition.in_force.on_table_changed("a")
         self.send_blocks(stream, samples, 20, 30)
         estimator = make_estimator(SETTINGS, other_cell)
         estimator.run(samples[400:600])
@@ -470,7 +470,7 @@ class TestChangedSettings:
         if is_taken_over:  # a new owner reads the new settings at once
             stream.take_over()
         else:
-            stream.partition.in_force.forget_type("a")
+            stream.partition.in_force.on_table_changed("a")
         stream.send("a", blocks_of(samples)[3])  # it was processed before, and migrates nothing
         result = self.send_blocks(stream, samples, 20, 21)
         state = Estimate.model_validate_json(result.state)
@@ -485,10 +485,10 @@ class TestChangedSettings:
         stream = Stream(Partition(5, packs.get))
         self.send_blocks(stream, samples, 0, 10)
         row = packs.pop("a")
-        stream.partition.in_force.forget_type("a")
+        stream.partition.in_force.on_table_changed("a")
         assert self.send_blocks(stream, samples, 10, 20).state is None
         packs["a"] = row
-        stream.partition.in_force.forget_type("a")
+        stream.partition.in_force.on_table_changed("a")
         assert len(stream.process_deferred()) == 10
         assert_state_equals(stream, "a", record_of_one_run(samples[:400]))
 

@@ -13,6 +13,7 @@ from structlog.testing import capture_logs
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.block_loop import BlockLoop
+from bms_estimator.fleet.worker.block_runner import Totals
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
@@ -74,8 +75,8 @@ async def test_block_with_an_internal_error_is_skipped_and_counted_as_a_fault(nc
         return registry(pack)
 
     async with _running_lease(nc, table, 1) as lease:
-        await until(lambda: lease.runner.blocks >= len(PACKS), lambda: lease.runner.blocks)
-        assert lease.runner.faults == 1
+        await until(lambda: lease.totals.blocks >= len(PACKS), lambda: lease.totals.blocks)
+        assert lease.totals.faults == 1
         assert lease.partition
         assert lease.partition.counters["blocks"] == len(PACKS) - 1
 
@@ -85,7 +86,7 @@ async def test_guarded_replay_reads_each_message_from_the_stream_once(nc: Client
     await _claim_without_checkpoint(nc, GUARDED_CLAIMS)
     async with _running_lease(nc, registry, REPLAYED_BLOCKS) as lease:
         received = nc.stats["in_msgs"]
-        await until(lambda: lease.runner.blocks == blocks, lambda: lease.runner.blocks)
+        await until(lambda: lease.totals.blocks == blocks, lambda: lease.totals.blocks)
         # each message is delivered and read
         assert nc.stats["in_msgs"] - received < 3 * blocks
 
@@ -94,19 +95,19 @@ async def test_guarded_replay_ends_when_another_worker_claims_the_partition(nc: 
     registry, blocks = await load_packs(nc, PACKS), REPLAYED_BLOCKS * len(PACKS)
     await _claim_without_checkpoint(nc, GUARDED_CLAIMS)
     async with _running_lease(nc, registry, REPLAYED_BLOCKS) as lease:
-        await until(lambda: lease.runner.blocks, lambda: lease.runner.blocks)
+        await until(lambda: lease.totals.blocks, lambda: lease.totals.blocks)
         await _claim_without_checkpoint(nc, 1)
         await lease.save()
         assert not lease.is_owned
-        dropped = lease.runner.blocks + 1  # one more is being processed
-        await until(lambda: lease.partition and lease.partition.sequence == blocks, lambda: lease.runner.blocks)
-        assert lease.runner.blocks <= dropped + blocks
+        dropped = lease.totals.blocks + 1  # one more is being processed
+        await until(lambda: lease.partition and lease.partition.sequence == blocks, lambda: lease.totals.blocks)
+        assert lease.totals.blocks <= dropped + blocks
 
 
 async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_the_checkpoint(nc: Client) -> None:
     registry = await load_packs(nc, PACKS)
     async with _running_lease(nc, registry, 1) as lease:
-        await until(lambda: lease.runner.blocks >= len(PACKS), lambda: lease.runner.blocks)
+        await until(lambda: lease.totals.blocks >= len(PACKS), lambda: lease.totals.blocks)
         # another worker claims the partition and dies, so that its pin lapses
         await _claim_without_checkpoint(nc, 1)
 
@@ -117,7 +118,7 @@ async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_t
         with capture_logs() as logs:
             await until(is_fenced, lambda: logs)
             # the checkpoint has no block yet, so that the first block of each pack is processed again
-            await until(lambda: lease.runner.blocks >= 2 * len(PACKS), lambda: lease.runner.blocks)
+            await until(lambda: lease.totals.blocks >= 2 * len(PACKS), lambda: lease.totals.blocks)
         assert lease.partition
         assert lease.partition.counters["blocks"] == len(PACKS)
         for pack in PACKS:
@@ -145,6 +146,7 @@ async def _running_lease(nc: Client, table: PackLookup, blocks: int) -> AsyncGen
         await open_checkpoints(nc, "w"),
         inbox,
         block_loop,
+        Totals(),
         partitions=1,
         checkpoint_format=lambda: FORMAT,
         is_busy=lambda: False,

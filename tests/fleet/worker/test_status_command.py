@@ -1,7 +1,6 @@
 """``fleet status`` with heartbeats of workers of several versions."""
 
 import asyncio
-import json
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 
@@ -15,7 +14,6 @@ from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.process.runtime import end
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, running
-from tests.fleet.workers import OLD_HEARTBEAT
 from tests.patience import LONG_S
 
 HOUR_S = 3600.0
@@ -47,14 +45,15 @@ async def status(capsys: pytest.CaptureFixture[str], url: str, *options: object)
     return await asyncio.to_thread(run, capsys, "fleet", "status", "--server", url, *options)
 
 
-async def test_worker_of_a_version_without_formats_is_listed_as_one_of_the_first_formats(cluster, capsys) -> None:
+async def test_formats_of_workers_are_listed_and_an_older_block_version_gives_exit_code_1(cluster, capsys) -> None:
     new = Heartbeat(id="new", started_s=1.79e9, version="9.9", checkpoint_format=2, block_version=2).model_dump_json()
-    async with sending(cluster.url, json.dumps(OLD_HEARTBEAT).encode(), new.encode()):
+    old = Heartbeat(id="old", started_s=1.79e9, version="9.8", partitions=(0, 1), packs=7).model_dump_json()
+    async with sending(cluster.url, old.encode(), new.encode()):
         code, out, err = await status(capsys, cluster.url, "--blocks", 2)
     assert (code, err) == (1, "")
     assert [line.split() for line in out.splitlines() if line.strip().startswith(("new", "old"))] == [
         ["new", "9.9", "0", "0", "1,", "2", "2"],
-        ["old", "2", "7", "1", "1"],
+        ["old", "9.8", "2", "7", "1", "1"],
     ]
     assert "blocks of version 2 are unreadable for old" in out
 
@@ -115,7 +114,8 @@ async def test_one_node_of_three_is_the_reason_why_streams_cannot_be_read(tmp_pa
 
 
 async def test_unreadable_heartbeat_is_reported_and_the_others_are_listed(cluster, capsys) -> None:
-    async with sending(cluster.url, b"{}", json.dumps(OLD_HEARTBEAT).encode()):
+    old = Heartbeat(id="old", started_s=1.79e9).model_dump_json()
+    async with sending(cluster.url, b"{}", old.encode()):
         code, out, err = await status(capsys, cluster.url)
     assert (code, "old" in out) == (0, True)
     assert err.startswith("warning: the heartbeat on fleet.worker.w0 is unreadable")

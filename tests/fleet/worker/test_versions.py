@@ -12,8 +12,8 @@ from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import RefusedPartition
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer
-from bms_estimator.fleet.packs.pack_bucket import read_bucket
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.partition import Partition

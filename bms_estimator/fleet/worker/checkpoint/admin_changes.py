@@ -18,12 +18,12 @@ import nats.errors
 from nats.aio.client import Client
 
 from bms_estimator.edge import subjects
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointInfo, CheckpointPointer, pointer_key
 from bms_estimator.fleet.nats.connection import RETRY_S
 from bms_estimator.fleet.nats.message_erasure import erase_messages
-from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.fleet.nats.streams import PRIORITY_GROUP, RESPONSE_TIMEOUT_S, consumer, require_partitions
-from bms_estimator.fleet.packs.pack_bucket import POLL_S, purge_keys, read_bucket, remove_keys
+from bms_estimator.fleet.packs.pack_bucket import POLL_S, purge_keys, remove_keys
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import (
     CheckpointError,
     PartitionCheckpoint,
@@ -179,7 +179,8 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
     Raises:
         UserError: The server has no streams, or the last checkpoint of a partition has a format that this program cannot
             read; then nothing is erased.
-        StreamError: The server rejects a request.
+        StreamError: The server does not respond, or rejects reading a stream.
+        nats.errors.Error: The server rejects another request.
     """
     partitions = await require_partitions(nc)
     store = await open_checkpoints(nc, ERASE_NAME)
@@ -287,21 +288,13 @@ def _without(part: Mapping[str, V], packs: Collection[str]) -> dict[str, V]:
 async def _remaining(nc: Client, packs: Collection[str]) -> dict[str, dict[str, int]]:
     """Return the numbers of messages with a pack's name in their subject, by pack and stream."""
     remaining: dict[str, dict[str, int]] = {pack: {} for pack in packs}
-    for stream in (await _api(nc, "STREAM.NAMES", {}))["streams"] or ():
+    js = nc.jetstream()
+    for stream in [info.config.name or "" for info in await js.streams_info()]:
         for pack in packs:
-            count = await _count_messages(nc, stream, pack)
-            if count:
+            infos = [await js.stream_info(stream, each) for each in _pack_subjects(stream, pack)]
+            if count := sum(sum((info.state.subjects or {}).values()) for info in infos):
                 remaining[pack][stream] = count
     return remaining
-
-
-async def _count_messages(nc: Client, stream: str, pack: str) -> int:
-    """Return the number of a stream's messages with a pack's name in their subject."""
-    count = 0
-    for subject in _pack_subjects(stream, pack):
-        info = await _api(nc, f"STREAM.INFO.{stream}", {"subjects_filter": subject})
-        count += sum((info["state"].get("subjects") or {}).values())
-    return count
 
 
 def _pack_subjects(stream: str, pack: str) -> list[str]:
@@ -325,16 +318,3 @@ def _pack_subjects(stream: str, pack: str) -> list[str]:
         return fleet_subjects[stream]
     leading = [".".join(["*"] * tokens) for tokens in range(1, MAX_TOKENS)]
     return [f"{each}.{pack}{rest}" for each in leading for rest in ("", ".>")]
-
-
-async def _api(nc: Client, operation: str, request: dict[str, Any]) -> dict[str, Any]:
-    """Send a request to the JetStream API, because nats-py does not support filters of subjects.
-
-    Raises:
-        StreamError: The server rejects the request.
-    """
-    response = await nc.request(f"$JS.API.{operation}", json.dumps(request).encode(), timeout=RESPONSE_TIMEOUT_S)
-    decoded: dict[str, Any] = json.loads(response.data)
-    if "error" in decoded:
-        raise StreamError(f"the server rejects {operation}: {decoded['error'].get('description', '')}")
-    return decoded

@@ -72,8 +72,8 @@ def _with_increments(header: Header) -> Header:
     return header | {"increment": 0}
 
 
-MIGRATION: HeaderMigration | None = HeaderMigration(upgrade=_with_increments, downgrade=_without_increments)
-"""Migration between format ``FORMAT - 1`` and ``FORMAT``; None while ``FORMAT`` is the first format."""
+MIGRATION = HeaderMigration(upgrade=_with_increments, downgrade=_without_increments)
+"""Migration between format ``FORMAT - 1`` and ``FORMAT``."""
 
 
 class UnreadableFormatError(CheckpointError):
@@ -85,18 +85,15 @@ class UnreadableFormatError(CheckpointError):
 
     def __init__(self, found: int) -> None:
         what = f"the checkpoint is of format {found}" if found else "the pointer to the checkpoints is unreadable"
-        super().__init__(f"{what}, this version reads {readable_text()}: start a worker of the version that wrote it")
+        super().__init__(
+            f"{what}, this version reads {FORMAT - 1} and {FORMAT}: start a worker of the version that wrote it"
+        )
         self.format = found
 
 
 def oldest_format() -> int:
     """Return the oldest format that this version reads and writes."""
-    return FORMAT if MIGRATION is None else FORMAT - 1
-
-
-def readable_text() -> str:
-    """Return the readable formats as text, such as ``1 and 2``."""
-    return f"{FORMAT}" if MIGRATION is None else f"{FORMAT - 1} and {FORMAT}"
+    return FORMAT - 1
 
 
 def is_readable(found: int) -> bool:
@@ -111,16 +108,6 @@ def common_format(newest_formats: Iterable[int]) -> int:
         newest_formats: Newest format that each other worker reads.
     """
     return max(oldest_format(), min([FORMAT, *newest_formats]))
-
-
-def upgrade(header: Header, file_format: int) -> Header:
-    """Return a header of a readable format as one of ``FORMAT``."""
-    return MIGRATION.upgrade(header) if MIGRATION and file_format < FORMAT else header
-
-
-def downgrade(header: Header, file_format: int) -> Header:
-    """Return a header of ``FORMAT`` as one of a format that this version writes."""
-    return MIGRATION.downgrade(header) if MIGRATION and file_format < FORMAT else header
 
 
 CHUNK_BYTES = 1 << 20
@@ -201,7 +188,8 @@ class PartitionCheckpoint:
             "layouts": [json.loads(layout) for layout in layouts],
             "entries": len(self.packs) + len(self.other_layouts),
         }
-        text = json.dumps(downgrade(header, file_format), separators=(",", ":")).encode()
+        header = MIGRATION.downgrade(header) if file_format < FORMAT else header
+        text = json.dumps(header, separators=(",", ":")).encode()
         chunk = [_FILE_HEAD.pack(_MAGIC, file_format, len(text), zlib.crc32(text)), text]
         entries: list[bytes] = []
         size = 0
@@ -264,7 +252,8 @@ def _read(data: memoryview) -> tuple[PartitionCheckpoint, int]:
     if not is_readable(file_format):
         raise UnreadableFormatError(file_format)
     header_end = _FILE_HEAD.size + length
-    header = upgrade(json.loads(_verify(data[_FILE_HEAD.size : header_end], length, crc)), file_format)
+    header = json.loads(_verify(data[_FILE_HEAD.size : header_end], length, crc))
+    header = MIGRATION.upgrade(header) if file_format < FORMAT else header
     layouts = [json.dumps(layout, separators=(",", ":")) for layout in header["layouts"]]
     for layout in layouts:
         if layout != CURRENT_LAYOUT:

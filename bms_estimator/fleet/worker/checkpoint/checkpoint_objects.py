@@ -7,7 +7,6 @@ unfinished object can be found and removed.
 import asyncio
 import base64
 import hashlib
-import io
 import json
 import time
 from collections.abc import Iterator
@@ -24,7 +23,7 @@ from bms_estimator.fleet.nats.stored_messages import read_messages
 from bms_estimator.model.clock import iso_utc
 
 MESSAGE_BYTES = 128 << 10
-"""Size of one message of an object [bytes]."""
+"""Maximum size of one message of an object [bytes]."""
 _STREAM = f"OBJ_{subjects.STATES_BUCKET}"
 
 
@@ -44,18 +43,19 @@ class CheckpointObjects:
 
         Args:
             name: Name of the object (``object_name``). Chunks of an earlier attempt are removed.
-            chunks: Bytes of the object; iterated in a thread.
+            chunks: Bytes of the object, in parts that are not empty; iterated in a thread.
 
         Raises:
             nats.js.errors.APIError: The server rejects the object.
         """
         subject, digest, size, count = _chunk_subject(name), hashlib.sha256(), 0, 0
         await self._js.purge_stream(_STREAM, subject=subject)
-        reader = io.BufferedReader(_ChunkReader(chunks), MESSAGE_BYTES)
-        while message := await asyncio.to_thread(reader.read, MESSAGE_BYTES):
-            await self._js.publish(subject, message)
-            digest.update(message)
-            size, count = size + len(message), count + 1
+        while chunk := await asyncio.to_thread(next, chunks, None):
+            digest.update(chunk)
+            for first in range(0, len(chunk), MESSAGE_BYTES):
+                await self._js.publish(subject, chunk[first : first + MESSAGE_BYTES])
+                count += 1
+            size += len(chunk)
         info = ObjectInfo(
             name=name,
             bucket=subjects.STATES_BUCKET,
@@ -97,28 +97,6 @@ class CheckpointObjects:
         """Remove an object, and let the server overwrite its bytes on the disk."""
         await erase_messages(self._nc, _STREAM, _chunk_subject(name))
         await self.remove(name)
-
-
-class _ChunkReader(io.RawIOBase):
-    """Readable file with the bytes of an iterator."""
-
-    def __init__(self, chunks: Iterator[bytes]) -> None:
-        self._chunks = chunks
-        self._unread = memoryview(b"")  # unread part of the last chunk
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        while not self._unread:
-            chunk = next(self._chunks, None)
-            if chunk is None:
-                return 0
-            self._unread = memoryview(chunk)
-        count = min(len(buffer), len(self._unread))
-        buffer[:count] = self._unread[:count]
-        self._unread = self._unread[count:]
-        return count
 
 
 def object_name(partition: int, unique_id: str) -> str:
