@@ -129,7 +129,7 @@ MAX_PART_SAMPLES = 4096
 """Maximum number of samples that are added at a time. They make at most as many blocks."""
 MAX_UNCONFIRMED_OF_PACK = 5000
 """Number of unconfirmed blocks of a pack at which the backfill waits. ``MAX_PART_SAMPLES`` more blocks may follow. The sum is
-below ``store_table.MAX_PACK_BLOCKS``, so that no block is dropped."""
+below ``ingest_store.MAX_PACK_BLOCKS``, so that no block is dropped."""
 MAX_UNCONFIRMED = 1_000_000
 """Number of unconfirmed blocks of all packs at which the backfill waits: 0.6 GB of minute blocks at 1 Hz."""
 SAVE_SAMPLES = 10_000
@@ -200,7 +200,7 @@ class Backfill:
                 self._unknown.add(pack)
                 self._counters["unknown"] += batch.samples.size
                 continue
-            if pack not in self._store:
+            if pack not in self._store.blocks:
                 await self._add_pack(pack)
             for first in range(0, batch.samples.size, MAX_PART_SAMPLES):
                 await self._wait_for_confirmations(pack)
@@ -213,7 +213,7 @@ class Backfill:
         if self._stop.is_set():
             await self._store.send_remaining()
         else:
-            await until_first_ends(self._store.publisher.idle.wait(), self._stop.wait())
+            await until_first_ends(self._store.wait_until_sent(), self._stop.wait())
 
     async def _add_pack(self, pack: str) -> None:
         while not self._stop.is_set():
@@ -226,9 +226,8 @@ class Backfill:
                 return
 
     async def _add(self, pack: str, batch: BatchSamples) -> None:
-        sequence = (
-            self._store.progress.sequence + 1
-        )  # a value with which ``save`` leaves the progress in ``TELEMETRY`` unchanged
+        # a value with which ``save`` leaves the progress in ``TELEMETRY`` unchanged
+        sequence = self._store.blocks.progress.sequence + 1
         selection = self._store.add(pack, batch, time.time(), sequence)
         self._counters["samples"] += selection.samples.size
         self._counters["old"] += selection.old
@@ -239,10 +238,10 @@ class Backfill:
 
     async def _save(self) -> None:
         self._unsaved = 0
-        await self._store.save(self._store.progress.stream, self._store.progress.sequence)
+        await self._store.save(*self._store.blocks.progress)
         if time.monotonic() >= self._progress_s:
             self._progress_s = time.monotonic() + PROGRESS_S
-            log.info("backfill", **self._counters, unconfirmed=self._store.unconfirmed)
+            log.info("backfill", **self._counters, unconfirmed=self._store.blocks.unconfirmed)
 
     async def _wait_for_confirmations(self, pack: str) -> None:
         """Wait until workers have confirmed enough blocks for further samples."""
@@ -251,9 +250,12 @@ class Backfill:
             await self._save()
             if time.monotonic() >= request_s:
                 request_s = time.monotonic() + REQUEST_S
-                for each in self._store.packs:
-                    await self._store.request_confirmation(each)
+                for each in self._store.blocks.packs:
+                    self._store.request_confirmation(each)
             await asyncio.sleep(WAIT_S)
 
     def _may_add(self, pack: str) -> bool:
-        return self._store.unconfirmed_of(pack) < MAX_UNCONFIRMED_OF_PACK and self._store.unconfirmed < MAX_UNCONFIRMED
+        return (
+            self._store.blocks.unconfirmed_of(pack) < MAX_UNCONFIRMED_OF_PACK
+            and self._store.blocks.unconfirmed < MAX_UNCONFIRMED
+        )

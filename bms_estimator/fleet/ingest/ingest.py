@@ -143,7 +143,7 @@ class Ingest:
     ) -> None:
         self._nc, self._store, self._bucket, self._reader, self._notifier = nc, store, bucket, reader, notifier
         self._buffer_bytes = buffer_bytes
-        self._telemetry = TelemetryReader(nc, store.progress.stream, store.progress.sequence)
+        self._telemetry = TelemetryReader(nc, *store.blocks.progress)
         self._reports = BatchReports(nc)
         self._counters = self._reports.counters
         self._trouble = ""
@@ -196,7 +196,7 @@ class Ingest:
         """Apply changes of the table, save overdue blocks, check the stream, and report readiness to systemd."""
         await self._bucket.refresh()
         # a new server has an empty table, which must not remove the packs
-        for pack in self._store.packs if len(self._bucket.packs) else ():
+        for pack in self._store.blocks.packs if len(self._bucket.packs) else ():
             if pack not in self._bucket.packs:
                 log.info("a pack was removed from the table; its stored blocks are removed", pack=pack)
                 self._store.remove(pack)
@@ -210,7 +210,7 @@ class Ingest:
     async def _check_stream(self) -> None:
         """Check the stream, and create it again if it is missing or damaged."""
         try:
-            lost = await self._telemetry.check(self._store.progress.sequence)
+            lost = await self._telemetry.check(self._store.blocks.progress.sequence)
             if lost is not None:
                 await self._on_lost(lost)
         except MissingStreamError:  # the server was replaced
@@ -246,7 +246,7 @@ class Ingest:
         if any(pack not in self._bucket.packs for pack in packs):
             await self._bucket.refresh()  # the pack may be new
         for pack in packs:
-            if pack in self._bucket.packs and pack not in self._store:
+            if pack in self._bucket.packs and pack not in self._store.blocks:
                 await self._store.add_pack(pack)
         for i, message in enumerate(messages):
             await self._process_one(message)
@@ -256,7 +256,7 @@ class Ingest:
     async def _process_one(self, message: StoredMessage) -> None:
         pack = message.subject.partition(".")[2]
         self._counters["batches"] += 1
-        if pack not in self._store:
+        if pack not in self._store.blocks:
             await self._reports.reject_unknown(message, pack)
             return
         last_s, counts = self._store.last_s(pack), Counter[str]()
@@ -291,14 +291,14 @@ class Ingest:
 
     def _log_status(self) -> None:
         self._reports.log_unknown()
-        publisher = self._store.publisher
+        blocks = self._store.blocks
         log.info(
             "ingested",
             **self._counters,
-            blocks_sent=publisher.published,
-            resends=publisher.resends,
-            unconfirmed=self._store.unconfirmed,
-            dropped_blocks=self._store.dropped,
+            blocks_sent=self._store.published,
+            resends=blocks.resends,
+            unconfirmed=blocks.unconfirmed,
+            dropped_blocks=blocks.dropped,
         )
 
 
