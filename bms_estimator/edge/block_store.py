@@ -5,6 +5,7 @@ only after its number is on disk, since a restart could otherwise use the number
 """
 
 import asyncio
+import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -20,10 +21,10 @@ from bms_estimator.edge.block_table import (
     BlockRange,
     PackPosition,
     Page,
-    PageRead,
     Progress,
-    StoreTransaction,
+    read_pages,
     read_state,
+    write_changes,
 )
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.mqtt.connection import Message, QueuedMessage
@@ -174,12 +175,13 @@ class BlockStore:
                 await self._block_ready.wait()
             repeats, self._repeats = self._repeats[:max_count], self._repeats[max_count:]
             unsent = ((pack, self._packs[pack]) for pack in itertools.islice(self._unsent, max_count))
-            ranges = [
+            ranges = repeats + [
                 BlockRange(pack, entry.position.created_s, entry.cursor, entry.position.next_number)
                 for pack, entry in unsent
             ]
+            read = functools.partial(read_pages, ranges=ranges, max_blocks=max_count)
             try:
-                pages = await self._database.call(PageRead([*repeats, *ranges], max_count))
+                pages = await self._database.call(read)
             except StoreError:
                 await asyncio.sleep(RETRY_S)
                 continue
@@ -233,9 +235,16 @@ class BlockStore:
         """Write the first waiting blocks and all changed positions."""
         packs = {pack: self._packs.setdefault(pack, _Pack(PackPosition())) for pack in changed}
         before = {pack: entry.position for pack, entry in packs.items()}
-        after = await self._database.call(
-            StoreTransaction(before, waiting, removed, progress, self._max_blocks, self._max_bytes)
+        write = functools.partial(
+            write_changes,
+            positions=before,
+            waiting=waiting,
+            removed=removed,
+            progress=progress,
+            max_blocks=self._max_blocks,
+            max_bytes=self._max_bytes,
         )
+        after = await self._database.call(write)
         del self._waiting[: len(waiting)]
         self.progress = progress
         if self._open_count != self._database.open_count:  # a damaged or deleted file was replaced by an empty one

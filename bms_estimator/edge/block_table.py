@@ -3,7 +3,6 @@
 import math
 import sqlite3
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -117,46 +116,50 @@ def _is_position(row: Sequence[Any]) -> bool:
     return 0 <= position.created_s <= LATEST_S and 1 <= position.oldest <= position.next_number < MAX_NUMBER
 
 
-@dataclass(frozen=True)
-class StoreTransaction:
-    """Idempotent transaction that numbers and inserts blocks, and deletes blocks that are confirmed or exceed a limit.
+def write_changes(
+    connection: sqlite3.Connection,
+    positions: Mapping[str, PackPosition],
+    waiting: Sequence[tuple[str, ReadyBlock]],
+    removed: Collection[str],
+    progress: Progress,
+    *,
+    max_blocks: int,
+    max_bytes: float,
+) -> dict[str, PackPosition]:
+    """Insert blocks with numbers, and delete blocks that are confirmed or exceed a limit. A repetition has no further effect.
+
+    Args:
+        connection: Connection with an open transaction.
+        positions: Positions before ``waiting`` of all packs that have changed. Blocks before ``oldest`` are deleted.
+        waiting: Blocks to insert, by pack; sample times are seconds since 1970.
+        removed: Packs whose blocks and position are removed, before blocks are inserted.
+        progress: New content of table ``progress``.
+        max_blocks: Maximum number of stored blocks of a pack.
+        max_bytes: Maximum size of the database [bytes]. The newest block is always kept.
+
+    Returns:
+        The positions after the transaction.
 
     Raises:
         sqlite3.Error: The database cannot be written.
     """
-
-    positions: Mapping[str, PackPosition]
-    """Positions before ``waiting`` of all packs that have changed. Blocks before ``oldest`` are deleted."""
-    waiting: Sequence[tuple[str, ReadyBlock]]
-    """Blocks to insert, by pack; sample times are seconds since 1970."""
-    removed: Collection[str]
-    """Packs whose blocks and position are removed, before blocks are inserted."""
-    progress: Progress
-    max_blocks: int
-    """Maximum number of stored blocks of a pack."""
-    max_bytes: float
-    """Maximum size of the database [bytes]. The newest block is always kept."""
-
-    def __call__(self, connection: sqlite3.Connection) -> dict[str, PackPosition]:
-        """Run the transaction, and return the positions after it."""
-        for pack in self.removed:
-            connection.execute("DELETE FROM block WHERE pack = ?", (pack,))
-            connection.execute("DELETE FROM pack WHERE name = ?", (pack,))
-        positions = dict(self.positions)
-        for pack, ready in self.waiting:
-            positions[pack] = _insert(connection, pack, positions[pack], ready)
-        first = [(pack, max(at.oldest, at.next_number - self.max_blocks)) for pack, at in positions.items()]
-        connection.executemany("DELETE FROM block WHERE pack = ? AND number < ?", first)
-        oldest = "DELETE FROM block WHERE id = (SELECT min(id) FROM block) AND id < (SELECT max(id) FROM block)"
-        while _used_bytes(connection) > self.max_bytes and connection.execute(oldest).rowcount:
-            pass
-        for pack, at in positions.items():
-            positions[pack] = at._replace(oldest=_oldest(connection, pack, at.next_number))
-        rows = ((pack, *position) for pack, position in positions.items())
-        connection.executemany("INSERT OR REPLACE INTO pack VALUES (?, ?, ?, ?, ?, ?)", rows)
-        connection.execute("DELETE FROM progress")
-        connection.execute("INSERT INTO progress VALUES (?, ?)", self.progress)
-        return positions
+    for pack in removed:
+        connection.execute("DELETE FROM block WHERE pack = ?", (pack,))
+        connection.execute("DELETE FROM pack WHERE name = ?", (pack,))
+    after = dict(positions)
+    for pack, ready in waiting:
+        after[pack] = _insert(connection, pack, after[pack], ready)
+    first = [(pack, max(at.oldest, at.next_number - max_blocks)) for pack, at in after.items()]
+    connection.executemany("DELETE FROM block WHERE pack = ? AND number < ?", first)
+    oldest = "DELETE FROM block WHERE id = (SELECT min(id) FROM block) AND id < (SELECT max(id) FROM block)"
+    while _used_bytes(connection) > max_bytes and connection.execute(oldest).rowcount:
+        pass
+    after = {pack: at._replace(oldest=_oldest(connection, pack, at.next_number)) for pack, at in after.items()}
+    rows = ((pack, *position) for pack, position in after.items())
+    connection.executemany("INSERT OR REPLACE INTO pack VALUES (?, ?, ?, ?, ?, ?)", rows)
+    connection.execute("DELETE FROM progress")
+    connection.execute("INSERT INTO progress VALUES (?, ?)", progress)
+    return after
 
 
 class BlockRange(NamedTuple):
@@ -184,33 +187,25 @@ class Page(NamedTuple):
     """Number of the pack's oldest block on disk; ``range.end`` without one."""
 
 
-@dataclass(frozen=True)
-class PageRead:
-    """Transaction that reads blocks, and deletes damaged ones among them.
+def read_pages(connection: sqlite3.Connection, ranges: Sequence[BlockRange], max_blocks: int) -> list[Page]:
+    """Return at most ``max_blocks`` blocks, and delete damaged ones among them. Pages of the last ranges may be missing.
 
     Raises:
         sqlite3.Error: The database cannot be read or written.
     """
-
-    ranges: Sequence[BlockRange]
-    max_blocks: int
-    """Maximum number of blocks of all ranges together."""
-
-    def __call__(self, connection: sqlite3.Connection) -> list[Page]:
-        """Run the transaction. The pages of the last ranges may be missing."""
-        pages, left = list[Page](), self.max_blocks
-        query = "SELECT number, data FROM block WHERE pack = ? AND number >= ? AND number < ? ORDER BY number LIMIT ?"
-        for each in self.ranges:
-            rows = connection.execute(query, (each.pack, each.first, each.end, left)).fetchall()
-            blocks = {number: data for number, data in rows if _is_valid(each.created_s, number, data)}
-            damaged = [(each.pack, number) for number, _ in rows if number not in blocks]
-            connection.executemany("DELETE FROM block WHERE pack = ? AND number = ?", damaged)
-            looked_up = each if len(rows) < left else each._replace(end=rows[-1][0] + 1)
-            pages.append(Page(looked_up, blocks, bool(damaged), _oldest(connection, each.pack, each.end)))
-            left -= len(rows)
-            if not left:
-                break
-        return pages
+    pages, left = list[Page](), max_blocks
+    query = "SELECT number, data FROM block WHERE pack = ? AND number >= ? AND number < ? ORDER BY number LIMIT ?"
+    for each in ranges:
+        rows = connection.execute(query, (each.pack, each.first, each.end, left)).fetchall()
+        blocks = {number: data for number, data in rows if _is_valid(each.created_s, number, data)}
+        damaged = [(each.pack, number) for number, _ in rows if number not in blocks]
+        connection.executemany("DELETE FROM block WHERE pack = ? AND number = ?", damaged)
+        looked_up = each if len(rows) < left else each._replace(end=rows[-1][0] + 1)
+        pages.append(Page(looked_up, blocks, bool(damaged), _oldest(connection, each.pack, each.end)))
+        left -= len(rows)
+        if not left:
+            break
+    return pages
 
 
 def _insert(connection: sqlite3.Connection, pack: str, position: PackPosition, ready: ReadyBlock) -> PackPosition:

@@ -10,9 +10,9 @@ from bms_estimator.edge.block_table import (
     INGEST_TABLES,
     BlockRange,
     PackPosition,
-    PageRead,
     Progress,
-    StoreTransaction,
+    read_pages,
+    write_changes,
 )
 from bms_estimator.fleet.ingest.batch_columns import BatchError
 from bms_estimator.fleet.ingest.batch_samples import BatchReader, select_new
@@ -39,8 +39,8 @@ def test_edited_batches_are_rejected_with_a_reason_or_become_blocks(data: bytes)
     with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as database:
         migrate(database, INGEST_TABLES)
         waiting = [("p", block) for block in ready]
-        write = StoreTransaction({"p": PackPosition()}, waiting, (), Progress(), len(ready), math.inf)
-        position = write(database)["p"]
+        limits = {"max_blocks": len(ready), "max_bytes": math.inf}
+        position = write_changes(database, {"p": PackPosition()}, waiting, (), Progress(), **limits)["p"]
         blocks_of_pack = BlockRange("p", position.created_s, 1, position.next_number)
-        (page,) = PageRead([blocks_of_pack], len(ready) + 1)(database)
+        (page,) = read_pages(database, [blocks_of_pack], len(ready) + 1)
     assert sum(decode(data).samples.size for data in page.blocks.values()) == selection.samples.size
