@@ -14,8 +14,7 @@ from bms_estimator.edge.block_table import (
     read_pages,
     write_changes,
 )
-from bms_estimator.fleet.ingest.batch_columns import BatchError
-from bms_estimator.fleet.ingest.batch_samples import BatchReader, select_new
+from bms_estimator.fleet.ingest.batch_samples import BatchError, BatchReader, select_new
 from bms_estimator.fleet.ingest.ingest import decode_batch
 from bms_estimator.store.migrations import migrate
 from tests.fuzz.edited_seeds import edited_seeds

@@ -14,8 +14,7 @@ import pyarrow as pa
 import structlog
 
 from bms_estimator.fleet.ingest.arrow_batch import columns_of
-from bms_estimator.fleet.ingest.batch_columns import BatchError
-from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples
+from bms_estimator.fleet.ingest.batch_samples import BatchError, BatchReader, BatchSamples
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.ingest.startup import Options, open_ingest
 from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
@@ -27,7 +26,7 @@ from bms_estimator.sources.captures.tables.layout import Column
 PACK_COLUMN = "pack"
 """Column with the name of the pack. A file without this column has the samples of one pack, and is named after it."""
 BATCH_ROWS = 4096
-"""Maximum number of rows in memory. This number of rows with 255 cells each has fewer values than ``batch_columns.MAX_VALUES``."""
+"""Maximum number of rows in memory. This number of rows with 255 cells each has fewer values than ``batch_samples.MAX_VALUES``."""
 MEMORY = "1GB"
 """Memory for sorting; larger data are sorted on disk."""
 DAY_S = 86_400.0

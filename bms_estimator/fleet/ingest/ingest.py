@@ -11,9 +11,15 @@ from typing import Any
 import structlog
 from nats.aio.client import Client
 
-from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, check_count
 from bms_estimator.fleet.ingest.batch_reports import BatchReport, BatchReports
-from bms_estimator.fleet.ingest.batch_samples import BatchReader, drop_reason, split_by_time
+from bms_estimator.fleet.ingest.batch_samples import (
+    BatchColumns,
+    BatchError,
+    BatchReader,
+    check_count,
+    drop_reason,
+    split_by_time,
+)
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.ingest.startup import NAME, Options, open_ingest
 from bms_estimator.fleet.ingest.telemetry_reader import DamagedStreamError, MissingStreamError, TelemetryReader
