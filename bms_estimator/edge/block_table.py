@@ -15,10 +15,6 @@ LATEST_S = MAX_NUMBER // NS_PER_S - 1
 """Latest creation time of a store, in the year 2262 [s since 1970]."""
 MIN_CREATED_S = 1
 """Earliest creation time of a store [s since 1970]; 0 means that a pack has no store yet."""
-_BLOCKS = """
-    CREATE TABLE block (id INTEGER PRIMARY KEY, pack TEXT NOT NULL, number INTEGER NOT NULL, data BLOB NOT NULL);
-    CREATE UNIQUE INDEX block_number ON block (pack, number);
-"""
 _PACKS = """
     CREATE TABLE pack (
         name TEXT PRIMARY KEY, made_s INTEGER NOT NULL, next INTEGER NOT NULL, last_s REAL NOT NULL,
@@ -39,15 +35,13 @@ EDGE_TABLES = (
     CREATE TABLE block (number INTEGER PRIMARY KEY, data BLOB NOT NULL);
     """,
     f"""
-    ALTER TABLE block RENAME TO former_block; {_BLOCKS} {_PACKS}
-    INSERT INTO block (pack, number, data) SELECT '', number, data FROM former_block ORDER BY number;
+    ALTER TABLE block ADD COLUMN pack TEXT NOT NULL DEFAULT ''; {_PACKS}
     INSERT INTO pack SELECT '', made_s, next, made_s + last_s, 0, coalesce((SELECT min(number) FROM block), next) FROM store;
-    DROP TABLE former_block;
     DROP TABLE store;
     """,  # noqa: S608 - constant text
 )
 """Statements that create the tables of an edge, one item for each version, in the format of ``store.migrations.MIGRATIONS``.
-The name of its only pack is empty."""
+The name of its only pack is empty. The last version does not copy the blocks, because the disk may be full."""
 INGEST_TABLES = (
     """
     CREATE TABLE pack (
@@ -151,7 +145,7 @@ def write_changes(
         after[pack] = _insert(connection, pack, after[pack], ready)
     first = [(pack, max(at.oldest, at.next_number - max_blocks)) for pack, at in after.items()]
     connection.executemany("DELETE FROM block WHERE pack = ? AND number < ?", first)
-    oldest = "DELETE FROM block WHERE id = (SELECT min(id) FROM block) AND id < (SELECT max(id) FROM block)"
+    oldest = "DELETE FROM block WHERE rowid = (SELECT min(rowid) FROM block) AND rowid < (SELECT max(rowid) FROM block)"
     while _used_bytes(connection) > max_bytes and connection.execute(oldest).rowcount:
         pass
     after = {pack: at._replace(oldest=_oldest(connection, pack, at.next_number)) for pack, at in after.items()}
