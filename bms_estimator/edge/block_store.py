@@ -90,7 +90,7 @@ class BlockStore:
         self._messages = itertools.count(1)
         self._changed, self._removed = set[str](), set[str]()  # packs whose row on disk differs from memory
         self._open_count = 0  # ``Database.open_count`` at the last transaction
-        self._loss_logged = False
+        self._loss_logged = False  # since the last confirmation
         self._block_ready = asyncio.Event()
         self.connected = False
         self.dropped = self.resends = 0
@@ -156,6 +156,7 @@ class BlockStore:
             entry.position = position = position._replace(oldest=max(position.oldest, request.number))
             entry.cursor = max(entry.cursor, position.oldest)
             self._changed.add(pack)
+            self._loss_logged = False  # the server receives blocks
             if request.resend and request.number < entry.cursor:
                 self._resend(entry, request.number)
             self._update_unsent(pack)
@@ -250,7 +251,6 @@ class BlockStore:
         if self._open_count != self._database.open_count:  # a damaged or deleted file was replaced by an empty one
             self._open_count = self._database.open_count
             self._changed.update(self._packs)
-        self._loss_logged &= any(position.oldest > before[pack].oldest for pack, position in after.items())
         for pack, position in after.items():
             entry = self._packs.get(pack)
             if entry is packs[pack]:  # else a new store was begun meanwhile
