@@ -216,9 +216,11 @@ class BlockStore:
             changed.update(pack for pack, _ in waiting)
             if changed or removed or (progress or self.progress) != self.progress:
                 await self._write(waiting, changed, removed, progress or self.progress)
-        except StoreError:
+        except BaseException as error:
             self._changed |= changed
             self._removed |= removed
+            if not isinstance(error, StoreError):
+                raise
             self._drop_waiting()
             return False
         return True

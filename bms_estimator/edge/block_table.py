@@ -107,7 +107,8 @@ def _is_position(row: Sequence[Any]) -> bool:
     if [*map(type, row)] != [int, int, float, int, int]:
         return False
     position = PackPosition(*row)
-    return 0 <= position.created_s <= LATEST_S and 1 <= position.oldest <= position.next_number < MAX_NUMBER
+    is_plausible = 0 <= position.created_s <= LATEST_S and 1 <= position.oldest <= position.next_number < MAX_NUMBER
+    return is_plausible and 0 <= position.sent < position.next_number
 
 
 def write_changes(
@@ -225,10 +226,11 @@ def _used_bytes(connection: sqlite3.Connection) -> int:
     return int((pages - free) * page_bytes)
 
 
-def _oldest(connection: sqlite3.Connection, pack: str, default: int) -> int:
-    """Return the number of a pack's oldest block; ``default`` without one."""
-    (oldest,) = connection.execute("SELECT min(number) FROM block WHERE pack = ?", (pack,)).fetchone()
-    return default if oldest is None else int(oldest)
+def _oldest(connection: sqlite3.Connection, pack: str, end: int) -> int:
+    """Return the number of a pack's oldest block before the number ``end``; ``end`` without one."""
+    query = "SELECT coalesce(min(number), ?) FROM block WHERE pack = ? AND number < ?"
+    (oldest,) = connection.execute(query, (end, pack, end)).fetchone()
+    return int(oldest)
 
 
 def _is_valid(created_s: int, number: int, data: Any) -> bool:

@@ -1,15 +1,12 @@
 """Block sender with a real server. After each kind of fault the received samples equal those sent, in order."""
 
 import asyncio
-import contextlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
-import nats
 import numpy as np
 import pytest
 
-from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import PACK, BlockSender
 from bms_estimator.edge.subjects import BlockRequest
@@ -252,21 +249,3 @@ async def test_open_block_is_sent_if_the_source_falls_silent(
 async def test_unreadable_password_file_is_a_user_error(engine: NatsCluster, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^edge.password_file = /none: cannot be read"):
         BlockSender(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
-
-
-async def test_stream_stores_blocks_under_a_subject_of_the_pack(
-    receiver: Receiver, engine: NatsCluster, tmp_path: Path
-) -> None:
-    simulated = SimulatedEdge(receiver, tmp_path, url(engine))
-    async with simulated.edge:
-        simulated.add(2)
-        await receiver.wait_for_samples(60)
-    async with contextlib.AsyncExitStack() as stack:
-        nc = await nats.connect(engine.url)
-        stack.push_async_callback(nc.close)
-        stream = await nc.jetstream().stream_info(
-            subjects.RAW_STREAM,
-            subjects_filter=subjects.stored_raw(0).replace("0", "*", 1),  # all partitions
-        )
-        assert stream.state.subjects
-        assert sum(name.endswith(f".raw.{receiver.pack}") for name in stream.state.subjects) == 1

@@ -291,6 +291,11 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
         async with open_store(path) as store:
             await write_blocks(store, block_at(WALL_S + 500.0))
             (block,) = await take(store, 1)
+            store.on_request(PACK, BlockRequest(store=block.store_created_ns, number=2, resend=False))
+            await write_blocks(
+                store, block_at(WALL_S + 560.0)
+            )  # whether or not later blocks of the former store remain
+            assert numbers(await take(store, 1)) == [2]
     assert block.store_created_ns > created_s * NS_PER_S
     assert block.number == 1
     quarantined = [line for line in lines if line["event"] == "database set aside, a new one is begun"]

@@ -35,6 +35,8 @@ ACK_TIMEOUT_S = 5.0
 """Timeout of the acknowledgments of a page [s]."""
 HANDOVER_S = 5.0
 """Time limit for sending the remaining blocks at shutdown [s]."""
+POLL_S = 0.05
+"""Interval between two checks for blocks without an acknowledgment [s]."""
 FILE = "ingest.sqlite"
 """Name of the database."""
 
@@ -73,7 +75,6 @@ class IngestStore:
         self._database = Database(folder / FILE, tables=INGEST_TABLES, sync_s=0.0, retry_s=RETRY_S)
         self.blocks = BlockStore(self._database, subjects.raw, max_blocks=MAX_PACK_BLOCKS)
         self._open: dict[str, _OpenBlock] = {}
-        self._acknowledged = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
@@ -164,9 +165,8 @@ class IngestStore:
 
     async def wait_until_sent(self) -> None:
         """Wait until the server has acknowledged all stored blocks."""
-        while self.blocks.waiting:
-            self._acknowledged.clear()
-            await self._acknowledged.wait()
+        while self.blocks.waiting:  # noqa: ASYNC110 - requests of workers end the wait, too
+            await asyncio.sleep(POLL_S)
 
     async def send_remaining(self) -> None:
         """Wait until the server has all stored blocks, but at most ``HANDOVER_S``. The next run sends the others."""
@@ -214,7 +214,6 @@ class IngestStore:
                 for number, _ in page:
                     self.blocks.acknowledge(number)
                 self.published, trouble = self.published + len(page), ""
-                self._acknowledged.set()
             finally:
                 for ack in acks:
                     ack.cancel()
