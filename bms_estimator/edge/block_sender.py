@@ -217,7 +217,7 @@ class BlockSender:
         self._block_s, self._batcher = settings.block_s, Batcher(settings.block_s, max_samples)
         self._sends_cells = settings.cells
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
-        self._request_topic, topic = _topic(subjects.block_request(pack)), _topic(subjects.raw(pack))
+        self._request_topic, topic = (each(pack).replace(".", "/") for each in (subjects.block_request, subjects.raw))
         max_bytes = settings.store_mib * MIB
         self.store = BlockStore(self._database, lambda _: topic, max_bytes=max_bytes, max_waiting=MAX_WAITING_SAMPLES)
         self.delivery, self.invalid_messages = DeliveryStats(), 0
@@ -357,7 +357,3 @@ class BlockSender:
         if not self.invalid_messages:
             log.warning("invalid message on the workers' topic", reason=reason, topic=topic[:100])
         self.invalid_messages += 1
-
-
-def _topic(subject: str) -> str:
-    return subject.replace(".", "/")

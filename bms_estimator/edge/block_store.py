@@ -221,7 +221,9 @@ class BlockStore:
             self._removed |= removed
             if not isinstance(error, StoreError):
                 raise
-            self._drop_waiting()
+            while len(self._waiting) > 1 and sum(block.samples.size for _, block in self._waiting) > self._max_waiting:
+                del self._waiting[0]
+                self._count_lost(1, "the disk cannot be written, and memory is full")
             return False
         return True
 
@@ -319,12 +321,6 @@ class BlockStore:
             self._block_ready.set()
         else:
             self._unsent.pop(pack, None)
-
-    def _drop_waiting(self) -> None:
-        """Drop the oldest blocks in memory beyond the limit."""
-        while len(self._waiting) > 1 and sum(ready.samples.size for _, ready in self._waiting) > self._max_waiting:
-            del self._waiting[0]
-            self._count_lost(1, "the disk cannot be written, and memory is full")
 
     def _count_lost(self, blocks: int, reason: str) -> None:
         if blocks > 0 and not self._loss_logged:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import duckdb
 import pyarrow as pa
@@ -33,13 +32,6 @@ DAY_S = 86_400.0
 """Duration of a day [s]."""
 
 
-class PackBatch(NamedTuple):
-    """Samples of one pack, in order of time."""
-
-    pack: str
-    batch: BatchSamples
-
-
 def parquet_files(paths: Sequence[Path]) -> list[Path]:
     """Return the Parquet files at paths, which are files or folders.
 
@@ -57,7 +49,9 @@ def parquet_files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-def read_history(files: Sequence[Path], reader: BatchReader, folder: Path) -> Generator[PackBatch, None, None]:
+def read_history(
+    files: Sequence[Path], reader: BatchReader, folder: Path
+) -> Generator[tuple[str, BatchSamples], None, None]:
     """Yield the samples of all packs day by day, and within a day pack by pack, so that several workers are busy.
 
     Args:
@@ -95,14 +89,14 @@ def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
-def _split(rows: pa.RecordBatch, reader: BatchReader) -> Iterator[PackBatch]:
+def _split(rows: pa.RecordBatch, reader: BatchReader) -> Iterator[tuple[str, BatchSamples]]:
     """Yield the samples of each pack in some rows."""
     packs = rows.column(PACK_COLUMN).to_pylist()
     for pack, group in itertools.groupby(range(len(packs)), packs.__getitem__):
         numbers = list(group)
         columns = columns_of(rows.slice(numbers[0], len(numbers)).drop_columns([PACK_COLUMN, "day"]))
         try:
-            yield PackBatch(pack or "", reader.read(columns))
+            yield pack or "", reader.read(columns)
         except BatchError as error:
             raise UserError(f"--parquet: pack {pack}: {error}") from None
 
@@ -191,7 +185,7 @@ class Backfill:
             f"{counters['unknown']:,} of packs that are not in the table of packs{f' ({unknown})' if unknown else ''}"
         )
 
-    async def send(self, history: Iterator[PackBatch]) -> None:
+    async def send(self, history: Iterator[tuple[str, BatchSamples]]) -> None:
         """Send the samples of all packs."""
         while (entry := await asyncio.to_thread(next, history, None)) is not None and not self._stop.is_set():
             pack, batch = entry
@@ -245,16 +239,13 @@ class Backfill:
     async def _wait_for_confirmations(self, pack: str) -> None:
         """Wait until workers have confirmed enough blocks for further samples."""
         request_s = time.monotonic() + REQUEST_S
-        while not self._stop.is_set() and not self._may_add(pack):
+        blocks = self._store.blocks
+        while not self._stop.is_set() and (
+            blocks.unconfirmed_of(pack) >= MAX_UNCONFIRMED_OF_PACK or blocks.unconfirmed >= MAX_UNCONFIRMED
+        ):
             await self._save()
             if time.monotonic() >= request_s:
                 request_s = time.monotonic() + REQUEST_S
-                for each in self._store.blocks.packs:
+                for each in blocks.packs:
                     self._store.request_confirmation(each)
             await asyncio.sleep(WAIT_S)
-
-    def _may_add(self, pack: str) -> bool:
-        return (
-            self._store.blocks.unconfirmed_of(pack) < MAX_UNCONFIRMED_OF_PACK
-            and self._store.blocks.unconfirmed < MAX_UNCONFIRMED
-        )

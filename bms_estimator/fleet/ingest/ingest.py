@@ -169,8 +169,7 @@ class Ingest:
             if pause_s:
                 await until_first_ends(asyncio.sleep(pause_s), stop.wait())
         self._notifier.stopping(NAME)
-        self._store.complete()
-        await self._save()
+        await self._save_open_blocks()
         await self._store.send_remaining()
         self._log_status()
 
@@ -239,7 +238,7 @@ class Ingest:
             log.error("the server has lost batches", batches=len(lost), first=lost[0], last=lost[-1])
 
     async def _save_open_blocks(self) -> None:
-        """Complete and save the open blocks, because their batches cannot be read again."""
+        """Complete and save the open blocks, whose batches are not read again."""
         self._store.complete()
         await self._save()
 
