@@ -2,13 +2,14 @@
 
 import math
 import sqlite3
+import zlib
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bms_estimator.edge.batching import ReadyBlock
-from bms_estimator.edge.block import MAX_NUMBER, Block, BlockError, decode, encode
+from bms_estimator.edge.block import HEADER_BYTES, MAX_NUMBER, Block, BlockError, decode_header, encode
 
 NS_PER_S = 1_000_000_000
 LATEST_S = MAX_NUMBER // NS_PER_S - 1
@@ -234,11 +235,12 @@ def _oldest(connection: sqlite3.Connection, pack: str, end: int) -> int:
 
 
 def _is_valid(created_s: int, number: int, data: Any) -> bool:
-    """Return True if a row holds the undamaged block of its number."""
+    """Return True if a row holds the undamaged block of its number, by its header and the checksum of its body."""
     if not isinstance(data, bytes):
         return False
     try:
-        block = decode(data)
-    except BlockError:
+        header = decode_header(data)
+        zlib.decompress(data[HEADER_BYTES:])
+    except (BlockError, zlib.error):
         return False
-    return block.store_created_ns == created_s * NS_PER_S and block.number == number
+    return header.store_created_ns == created_s * NS_PER_S and header.number == number

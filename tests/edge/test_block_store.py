@@ -322,7 +322,8 @@ async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
     async with open_store(path) as store:
         await write_blocks(store, *minute_blocks(6))
     with contextlib.closing(sqlite3.connect(path)) as connection:
-        connection.execute("UPDATE block SET data = zeroblob(200) WHERE number IN (1, 4)")
+        connection.execute("UPDATE block SET data = zeroblob(200) WHERE number = 1")
+        connection.execute("UPDATE block SET data = substr(data, 1, 60) WHERE number = 4")
         connection.execute("DELETE FROM block WHERE number = 5")
         connection.commit()
     async with open_store(path) as store:
