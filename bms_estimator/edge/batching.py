@@ -1,6 +1,5 @@
 """Division of samples into blocks. No I/O."""
 
-import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -41,12 +40,6 @@ class Batcher:
     def __len__(self) -> int:
         """Return the number of samples in the open block."""
         return self._count
-
-    def copy(self) -> "Batcher":
-        """Return a copy, to which samples can be added independently."""
-        other = copy.copy(self)
-        other._parts, other._cell_parts = self._parts.copy(), self._cell_parts.copy()  # noqa: SLF001 - of this class
-        return other
 
     def add(self, samples: SampleBlock, arrival_s: float, cells_v: CellBlock = NO_CELLS) -> list[ReadyBlock]:
         """Add samples in order of their times, with their cell voltages, if any. Return the blocks that they complete."""

@@ -31,6 +31,7 @@ from bms_estimator.edge import cell_voltages
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 
 _HEADER = struct.Struct("<4sBBHQQQd")
+HEADER_BYTES = _HEADER.size
 _OLDEST_OFFSET = 24
 """Offset of the field ``oldest`` in the header [bytes]."""
 _VERSION_OFFSET = 4
@@ -139,7 +140,7 @@ def decode(data: bytes) -> Block:
         BlockError: The bytes are not a block, or damaged.
     """
     header, count, cells = _decode_header(data)
-    samples, cells_v = _decode_body(data[_HEADER.size :], count, cells, _columns(data[_VERSION_OFFSET]))
+    samples, cells_v = _decode_body(data[HEADER_BYTES:], count, cells, _columns(data[_VERSION_OFFSET]))
     return Block(header.store_created_ns, header.number, header.oldest, header.arrival_s, samples, cells_v)
 
 
@@ -154,7 +155,7 @@ def decode_header(data: bytes) -> BlockHeader:
 
 def _decode_header(data: bytes) -> tuple[BlockHeader, int, int]:
     """Return the header of a block, and its numbers of samples and of cells."""
-    if len(data) < _HEADER.size or data[:4] != _MAGIC:
+    if len(data) < HEADER_BYTES or data[:4] != _MAGIC:
         raise BlockError(f"{len(data)} bytes without the header of a block")
     _, version, cells, count, store, number, oldest, arrival_s = _HEADER.unpack_from(data)
     if not _VERSION_WITHOUT_CELLS <= version <= VERSION:
@@ -171,7 +172,7 @@ def peek_header(data: bytes) -> tuple[int, float]:
 
     Return 0 and infinity for bytes that are not a block.
     """
-    if len(data) < _HEADER.size or data[:4] != _MAGIC:
+    if len(data) < HEADER_BYTES or data[:4] != _MAGIC:
         return 0, math.inf
     _, _, _, count, *_, arrival_s = _HEADER.unpack_from(data)
     return count, arrival_s if math.isfinite(arrival_s) else math.inf

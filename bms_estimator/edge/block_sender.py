@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import math
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
-from bms_estimator.edge.batching import MAX_SAMPLES, Batcher
-from bms_estimator.edge.block_store import BlockStore
+from bms_estimator.edge.batching import MAX_SAMPLES, Batcher, ReadyBlock
+from bms_estimator.edge.block_store import RETRY_S, BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES
 from bms_estimator.edge.cell_voltages import MAX_CELLS
 from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock
@@ -28,9 +28,10 @@ from bms_estimator.model.payloads.health import EdgeHealth
 from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, DeliveryStats, brokers, check
 from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
-from bms_estimator.process.runtime import FIRST_DELAY_S, finish
+from bms_estimator.process.runtime import FIRST_DELAY_S, end, finish
 from bms_estimator.settings.outputs import EdgeSettings
-from bms_estimator.store.database import RETRY_S, Database
+from bms_estimator.store.database import Database
+from bms_estimator.store.database import RETRY_S as DISK_RETRY_S
 
 Times = NDArray[np.float64]
 
@@ -154,6 +155,10 @@ def _fill_non_finite(source_s: Times, previous_s: float) -> Times:
 
 
 MIB = 1 << 20
+PACK = ""
+"""Name of the only pack in the store of an edge."""
+MAX_WAITING_SAMPLES = 500_000
+"""Maximum number of samples in memory while the disk cannot be written: 20 MB, or five days at one sample a second."""
 MAX_BLOCK_AGE = 1.5
 """Age at which an incomplete block is sent, as a multiple of the block duration."""
 FINAL_SEND_TIMEOUT_S = 2.0
@@ -201,16 +206,16 @@ class BlockSender:
         steady: Callable[[], float] = since_boot,
         max_samples: int = MAX_SAMPLES,
         first_delay_s: float = FIRST_DELAY_S,
-        retry_s: float = RETRY_S,
+        retry_s: float = DISK_RETRY_S,
         final_send_timeout_s: float = FINAL_SEND_TIMEOUT_S,
     ) -> None:
         self._clock, self._steady, self._final_send_timeout_s = clock or Clock(), steady, final_send_timeout_s
         self._block_s, self._batcher = settings.block_s, Batcher(settings.block_s, max_samples)
         self._sends_cells = settings.cells
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
-        self._request_topic = _topic(subjects.block_request(pack))
-        max_bytes = int(settings.store_mib * MIB)
-        self.store = BlockStore(self._database, _topic(subjects.raw(pack)), max_bytes, wall=self._clock.wall)
+        self._request_topic, topic = (each(pack).replace(".", "/") for each in (subjects.block_request, subjects.raw))
+        max_bytes = settings.store_mib * MIB
+        self.store = BlockStore(self._database, lambda _: topic, max_bytes=max_bytes, max_waiting=MAX_WAITING_SAMPLES)
         self.delivery, self.invalid_messages = DeliveryStats(), 0
         # blocks are not retained, so that there is nothing to send again after a rejection
         self._denied = DeniedTopics(self.delivery, lambda: None, first_delay_s)
@@ -229,8 +234,8 @@ class BlockSender:
         )
         self._sample_clock: SampleClock | None = None
         self._overdue_timer: asyncio.TimerHandle | None = None
-        self._task: asyncio.Task[None] | None = None
-        self._stack = contextlib.AsyncExitStack()
+        self._sync_requested = asyncio.Event()
+        self._tasks: list[asyncio.Task[None]] = []
 
     def take(self, samples: SampleBlock, cells_v: CellBlock = NO_CELLS) -> None:
         """Add samples that have just arrived, with times of the source's clock, without waiting.
@@ -242,17 +247,17 @@ class BlockSender:
         """
         if self._sample_clock is None:
             raise RuntimeError("the sender accepts samples only within its context")
-        if self._task is not None and self._task.done():
-            self._task.result()  # only an internal error ends the task: raise it
+        for task in self._tasks:
+            if task.done():
+                task.result()  # only an internal error ends a task: raise it
         wall_s = self._clock.wall()
         # a new store may have been created later than the sample clock's time, if a worker had blocks of a later store
-        self._sample_clock.advance_to(self.store.last_s)
+        self._sample_clock.advance_to(self.store.position(PACK).last_s)
         placed = samples.copy()
         placed["time_s"] = self._sample_clock.place(samples["time_s"], wall_s, self._steady())
         is_sent = self._sends_cells and cells_v.shape[1] <= MAX_CELLS
         completed = self._batcher.add(placed, wall_s, cells_v if is_sent else NO_CELLS)
-        for block in completed:
-            self.store.put(block)
+        self._put(completed)
         if completed or self._overdue_timer is None:
             self._watch_open_block()
 
@@ -268,19 +273,23 @@ class BlockSender:
 
     async def __aenter__(self) -> Self:
         """Open the store and start connecting to the server."""
-        await self._stack.enter_async_context(self._database)
-        await self._stack.enter_async_context(self.store)
-        self._sample_clock = SampleClock(self.store.last_s)
-        self._task = asyncio.create_task(self._link.run(), name="edge")
+        await self.store.sync()
+        position = self.store.position(PACK)
+        log.info("store of blocks", made_s=position.created_s, next=position.next_number, oldest=position.oldest)
+        self._sample_clock = SampleClock(position.last_s)
+        self._tasks = [asyncio.create_task(task) for task in (self._link.run(), self._sync_repeatedly())]
         return self
 
     async def __aexit__(self, *_error: object) -> None:
         """Complete the open block, and send blocks for at most ``final_send_timeout_s``. The next run sends the others."""
         self._end_block()
-        if self._task is not None:
-            self._link.closing.set()
-            await finish(self._task, self._final_send_timeout_s + DISCONNECT_TIMEOUT_S)
-        await self._stack.aclose()
+        self._link.closing.set()
+        linking, syncing = self._tasks
+        await finish(linking, self._final_send_timeout_s + DISCONNECT_TIMEOUT_S)
+        self._database.begin_shutdown()
+        await end(syncing)
+        await self.store.sync()
+        await self._database.__aexit__()
 
     def _watch_open_block(self) -> None:
         """Restart the timer that completes the open block if the source falls silent."""
@@ -291,9 +300,22 @@ class BlockSender:
         self._overdue_timer = asyncio.get_running_loop().call_later(due_s, self._end_block) if has_samples else None
 
     def _end_block(self) -> None:
-        for block in self._batcher.cut():
-            self.store.put(block)
+        self._put(self._batcher.cut())
         self._watch_open_block()
+
+    def _put(self, blocks: Sequence[ReadyBlock]) -> None:
+        for block in blocks:
+            self.store.put(PACK, block)
+            self._sync_requested.set()
+
+    async def _sync_repeatedly(self) -> None:
+        """Synchronize memory and disk on request, and retry after a failure."""
+        while True:
+            self._sync_requested.clear()
+            written = await self.store.sync()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(None if written else RETRY_S):
+                    await self._sync_requested.wait()
 
     async def _serve(self, connection: Connection) -> None:
         """Send and receive until the connection is lost or the edge closes."""
@@ -324,14 +346,10 @@ class BlockSender:
             except ValidationError:
                 self._count_invalid("unreadable", message.topic)
             else:
-                self.store.on_request(request)
+                self.store.on_request(PACK, request)
 
     def _count_invalid(self, reason: str, topic: str) -> None:
         """Count an invalid message on the workers' topic, and log the first one."""
         if not self.invalid_messages:
             log.warning("invalid message on the workers' topic", reason=reason, topic=topic[:100])
         self.invalid_messages += 1
-
-
-def _topic(subject: str) -> str:
-    return subject.replace(".", "/")

@@ -1,29 +1,35 @@
-"""Store of an edge's blocks. A block stays on disk until a worker has confirmed it, and is sent again on request.
+"""Store of the blocks of one pack or many. A block stays on disk until a worker has confirmed it, and is sent again on request.
 
 The event loop never waits for the disk. Blocks that cannot be written wait in memory without a number. A block is sent
 only after its number is on disk, since a restart could otherwise use the number again.
 """
 
 import asyncio
-import contextlib
+import functools
+import itertools
 import math
-import secrets
-import time
-from collections import deque
-from collections.abc import Callable
-from typing import Self
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 
 import structlog
 
 from bms_estimator.edge.batching import ReadyBlock
-from bms_estimator.edge.block import with_oldest
-from bms_estimator.edge.block_table import LATEST_S, NS_PER_S, PageRead, StoreResult, StoreTransaction
+from bms_estimator.edge.block import MAX_NUMBER, with_oldest
+from bms_estimator.edge.block_table import (
+    LATEST_S,
+    NS_PER_S,
+    BlockRange,
+    PackPosition,
+    Page,
+    Progress,
+    read_pages,
+    read_state,
+    write_changes,
+)
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.mqtt.connection import Message, QueuedMessage
 from bms_estimator.store.database import Database, StoreError
 
-MAX_WAITING_SAMPLES = 500_000
-"""Maximum number of samples in memory while the disk cannot be written: 20 MB, or five days at one sample a second."""
 RETRY_S = 1.0
 """Retry interval of a failed disk operation [s]. It may be short, because ``Database`` does not access a failed disk
 before its own retry delay has passed."""
@@ -34,235 +40,290 @@ can arrive."""
 log = structlog.get_logger(__name__)
 
 
+@dataclass
+class _Pack:
+    """Blocks of a pack on disk."""
+
+    position: PackPosition
+    cursor: int = 1
+    """Number of the next block to send."""
+    last_resend: tuple[int, float] = (0, -math.inf)
+    """Block number and time of the last resend."""
+
+
 class BlockStore:
-    """Store of blocks, in order, until a worker has confirmed them; implements ``mqtt.queue_sender.MessageQueue``.
+    """Store of blocks, in order for each pack, until a worker has confirmed them; implements ``mqtt.queue_sender.MessageQueue``.
 
     Args:
-        database: Database with ``EDGE_TABLES``, synced at each transaction; its owner opens and closes it.
-        topic: Topic of the blocks.
-        max_bytes: Maximum total size of blocks on disk [bytes]. Beyond it, the oldest block is dropped.
-        wall: Wall clock [s since 1970].
+        database: Database with ``EDGE_TABLES`` or ``INGEST_TABLES``, synced at each transaction; its owner opens and closes it.
+        topic: Function that returns the topic of a pack's blocks.
+        max_blocks: Maximum number of blocks of a pack on disk. Beyond it, the pack's oldest block is dropped.
+        max_bytes: Maximum size of the database [bytes]. Beyond it, the oldest block is dropped.
+        max_waiting: Maximum number of samples in memory after the disk has failed. Beyond it, the oldest block is dropped.
         resend_s: Minimum interval between two resends of one block [s].
 
     Attributes:
         connected: True if a broker is connected, as set by the sender.
         dropped: Number of blocks lost since start, because the disk was full or damaged.
+        resends: Number of accepted requests to send blocks again.
+        progress: Progress in the stream ``TELEMETRY``, as stored.
     """
 
     def __init__(
         self,
         database: Database,
-        topic: str,
-        max_bytes: int,
+        topic: Callable[[str], str],
         *,
-        wall: Callable[[], float] = time.time,
+        max_blocks: int = MAX_NUMBER,
+        max_bytes: float = math.inf,
+        max_waiting: float = math.inf,
         resend_s: float = RESEND_S,
     ) -> None:
-        self._database, self._topic, self._max_bytes = database, topic, max_bytes
-        self._wall, self._resend_s = wall, resend_s
-        self._run_id = secrets.token_hex(8)
-        self._put_count = 0  # blocks put by this process
-        self._waiting = deque[tuple[int, ReadyBlock]]()  # blocks that are not on disk yet, with their ``_put_count``
-        self._on_disk: StoreResult | None = None  # None before the first transaction
-        self._open_count_at_sync = 0  # value of database.open_count at the last transaction
-        self._first_unconfirmed = 1  # workers have confirmed all blocks with lower numbers
-        self._newer_than_s = 0  # the store must be created after this time [s since 1970]
-        self._cursor = 1  # number of the next block to send
-        self._unacknowledged = set[int]()  # numbers of sent blocks that the broker has not acknowledged
-        self._last_resend = (0, -math.inf)  # block number and time
-        self._loss_logged = False
-        self._block_ready, self._sync_requested = asyncio.Event(), asyncio.Event()
-        self._closing = False
-        self._task: asyncio.Task[None] | None = None
+        self._database, self._topic = database, topic
+        self._max_blocks, self._max_bytes, self._max_waiting = max_blocks, max_bytes, max_waiting
+        self._resend_s = resend_s
+        self._packs = dict[str, _Pack]()
+        self._waiting = list[tuple[str, ReadyBlock]]()  # blocks that are not on disk yet
+        self._unsent = dict[str, None]()  # packs with blocks on disk from their cursor on, in the order of sending
+        self._repeats = list[BlockRange]()  # single blocks to send again
+        self._in_flight = dict[int, tuple[str, int]]()  # pack and number of sent blocks, by number of the message
+        self._messages = itertools.count(1)
+        self._changed, self._removed = set[str](), set[str]()  # packs whose row on disk differs from memory
+        self._open_count = 0  # ``Database.open_count`` at the last transaction
+        self._loss_logged = False  # since the last confirmation
+        self._block_ready = asyncio.Event()
         self.connected = False
-        self.dropped = 0
+        self.dropped = self.resends = 0
+        self.progress = Progress()
 
     @property
-    def last_s(self) -> float:
-        """Time of the last sample on disk, or else the creation time of the store [s since 1970]; initially -inf."""
-        return self._on_disk.state.created_s + self._on_disk.state.last_s if self._on_disk else -math.inf
+    def packs(self) -> list[str]:
+        """Names of the packs with a position."""
+        return list(self._packs)
 
-    @property
-    def oldest(self) -> int:
-        """Number of the oldest block that can still be sent."""
-        return max(self._on_disk.oldest, self._first_unconfirmed) if self._on_disk else 1
+    def __contains__(self, pack: object) -> bool:
+        return pack in self._packs
+
+    def position(self, pack: str) -> PackPosition:
+        """Return the position of a pack on disk; the default for an unknown pack."""
+        return self._packs[pack].position if pack in self._packs else PackPosition()
+
+    def unconfirmed_of(self, pack: str) -> int:
+        """Return the number of blocks of a pack that no worker has confirmed."""
+        position = self.position(pack)
+        return position.next_number - position.oldest + sum(each == pack for each, _ in self._waiting)
 
     @property
     def unconfirmed(self) -> int:
         """Number of blocks that no worker has confirmed."""
-        return len(self._waiting) + (self._on_disk.state.next_number - self.oldest if self._on_disk else 0)
+        positions = (pack.position for pack in self._packs.values())
+        return len(self._waiting) + sum(position.next_number - position.oldest for position in positions)
 
     @property
     def waiting(self) -> int:
         """Number of blocks that the broker has not acknowledged."""
-        ready = self._on_disk.state.next_number - self._cursor if self._on_disk else 0
-        return len(self._waiting) + ready + len(self._unacknowledged)
+        unsent = (self._packs[pack] for pack in self._unsent)
+        ready = sum(pack.position.next_number - pack.cursor for pack in unsent)
+        return len(self._waiting) + ready + len(self._in_flight)
 
-    async def __aenter__(self) -> Self:
-        """Read the state of an earlier run and start the writing task."""
-        await self._sync()
-        self._task = asyncio.create_task(self._sync_repeatedly(), name="edge store")
-        return self
+    def add_pack(self, pack: str, position: PackPosition) -> None:
+        """Set the position of a pack that is not stored."""
+        self._forget_sent(pack)
+        self._packs[pack] = _Pack(position, max(position.sent + 1, position.oldest))
+        self._update_unsent(pack)
 
-    async def __aexit__(self, *_error: object) -> None:
-        """Write the remaining blocks."""
-        if self._task is None:
+    def remove(self, pack: str) -> None:
+        """Remove a pack and its blocks."""
+        self._forget_sent(pack)
+        self._packs.pop(pack, None)
+        self._waiting = [waiting for waiting in self._waiting if waiting[0] != pack]
+        self._changed.discard(pack)
+        self._removed.add(pack)
+
+    def put(self, pack: str, ready: ReadyBlock) -> None:
+        """Append a block, with times in seconds since 1970, without waiting for the disk. ``sync`` writes it."""
+        self._waiting.append((pack, ready))
+
+    def on_request(self, pack: str, request: BlockRequest) -> None:
+        """Handle a worker's request for the next block of a pack. A request for an unknown pack is ignored."""
+        if pack not in self._packs:
             return
-        self._closing = True
-        self._database.begin_shutdown()
-        self._sync_requested.set()
-        await self._task
+        entry, position = self._packs[pack], self.position(pack)
+        created_ns = position.created_s * NS_PER_S
+        if request.store > created_ns or (request.store == created_ns and request.number > position.next_number):
+            self._begin_store(pack, request.store)
+        elif request.store == created_ns:
+            entry.position = position = position._replace(oldest=max(position.oldest, request.number))
+            entry.cursor = max(entry.cursor, position.oldest)
+            self._changed.add(pack)
+            self._loss_logged = False  # the server receives blocks
+            if request.resend and request.number < entry.cursor:
+                self._resend(entry, request.number)
+            self._update_unsent(pack)
 
-    def put(self, ready: ReadyBlock) -> None:
-        """Append a block, with times in seconds since 1970, without waiting for the disk."""
-        if self._task is not None and self._task.done():
-            self._task.result()  # only an internal error ends the task: raise it
-        self._put_count += 1
-        self._waiting.append((self._put_count, ready))
-        while len(self._waiting) > 1 and sum(block.samples.size for _, block in self._waiting) > MAX_WAITING_SAMPLES:
-            self._waiting.popleft()
-            self._count_lost(1, "the disk cannot be written, and memory is full")
-        self._sync_requested.set()
-
-    def on_request(self, request: BlockRequest) -> None:
-        """Handle a worker's request for its next block."""
-        if self._on_disk is None or request.store < (created_ns := self._on_disk.state.created_s * NS_PER_S):
-            return
-        if request.store > created_ns or request.number > self._on_disk.state.next_number:
-            self._request_new_store(math.ceil(request.store / NS_PER_S))  # rounded up: the new store must be later
-            return
-        self._first_unconfirmed = max(self._first_unconfirmed, request.number)
-        self._cursor = max(self._cursor, self._first_unconfirmed)
-        self._unacknowledged = {number for number in self._unacknowledged if number >= self._first_unconfirmed}
-        if request.resend:
-            self._resend(request.number)
+    def repeat(self, pack: str, number: int) -> None:
+        """Send one block again, if it was sent and is still stored."""
+        position = self.position(pack)
+        if position.oldest <= number < self._packs[pack].cursor:
+            self._repeats.append(BlockRange(pack, position.created_s, number, number + 1))
+            self._block_ready.set()
 
     async def take(self, max_count: int) -> list[QueuedMessage]:
-        """Wait for a block, then return up to ``max_count`` consecutive ones."""
+        """Wait for a block, then return up to ``max_count`` blocks, consecutive ones of each pack."""
         while True:
-            while self._on_disk is None or self._cursor >= self._on_disk.state.next_number:
+            while not (self._unsent or self._repeats):
                 self._block_ready.clear()
                 await self._block_ready.wait()
-            created_s, first = self._on_disk.state.created_s, self._cursor
+            repeats, self._repeats = self._repeats[:max_count], self._repeats[max_count:]
+            unsent = ((pack, self._packs[pack]) for pack in itertools.islice(self._unsent, max_count))
+            ranges = repeats + [
+                BlockRange(pack, entry.position.created_s, entry.cursor, entry.position.next_number)
+                for pack, entry in unsent
+            ]
+            read = functools.partial(read_pages, ranges=ranges, max_blocks=max_count)
             try:
-                page = await self._database.call(PageRead(created_s, first, self._on_disk.state.next_number, max_count))
+                pages = await self._database.call(read)
             except StoreError:
                 await asyncio.sleep(RETRY_S)
                 continue
-            if (self._on_disk.state.created_s, self._cursor) != (created_s, first):
-                continue  # a reply or a new store has moved the cursor while the page was read
-            if page.first > first:
-                self._skip_damaged(page.first)
-            if page.blocks:
-                self._cursor = page.blocks[-1][0] + 1
-                self._unacknowledged |= {number for number, _ in page.blocks}
-                return [QueuedMessage(number, self._message(number, data)) for number, data in page.blocks]
+            if messages := [message for page in pages for message in self._send(page)]:
+                return messages
 
     def acknowledge(self, number: int, rejection: str = "") -> None:  # noqa: ARG002
         """Record that the broker has acknowledged a block. It stays stored, because the server may still lose it."""
-        self._unacknowledged.discard(number)
+        if sent := self._in_flight.pop(number, None):
+            pack, block = sent
+            position = self.position(pack)
+            self._packs[pack].position = position._replace(sent=max(position.sent, block))
+            self._changed.add(pack)
 
     def rewind(self) -> None:
         """Make ``take`` return all unacknowledged blocks again, in order, after a lost connection."""
-        self._cursor = min(self._unacknowledged, default=self._cursor)
-        self._unacknowledged.clear()
-        self._block_ready.set()
+        for pack, number in self._in_flight.values():
+            entry = self._packs[pack]
+            entry.cursor = max(min(entry.cursor, number), entry.position.oldest)
+            self._update_unsent(pack)
+        self._in_flight.clear()
 
-    def _message(self, number: int, data: bytes) -> Message:
-        return Message(self._topic, with_oldest(data, min(self.oldest, number)), 1, retain=False)
+    async def sync(self, progress: Progress | None = None) -> bool:
+        """Write all changes to disk, after the first call has read the state of an earlier run. Return False if the disk failed."""
+        waiting = self._waiting.copy()
+        changed, self._changed = self._changed, set()
+        removed, self._removed = self._removed, set()
+        try:
+            if not self._open_count:
+                await self._load()
+            changed.update(pack for pack, _ in waiting)
+            if changed or removed or (progress or self.progress) != self.progress:
+                await self._write(waiting, changed, removed, progress or self.progress)
+        except BaseException as error:
+            self._changed |= changed
+            self._removed |= removed
+            if not isinstance(error, StoreError):
+                raise
+            while len(self._waiting) > 1 and sum(block.samples.size for _, block in self._waiting) > self._max_waiting:
+                del self._waiting[0]
+                self._count_lost(1, "the disk cannot be written, and memory is full")
+            return False
+        return True
 
-    def _resend(self, number: int) -> None:
+    async def _load(self) -> None:
+        """Read the state of an earlier run."""
+        self.progress, positions = await self._database.call(read_state)
+        self._open_count = self._database.open_count
+        for pack, position in positions.items():
+            self.add_pack(pack, position)
+
+    async def _write(
+        self, waiting: Sequence[tuple[str, ReadyBlock]], changed: set[str], removed: set[str], progress: Progress
+    ) -> None:
+        """Write the first waiting blocks and all changed positions."""
+        packs = {pack: self._packs.setdefault(pack, _Pack(PackPosition())) for pack in changed}
+        before = {pack: entry.position for pack, entry in packs.items()}
+        write = functools.partial(
+            write_changes,
+            positions=before,
+            waiting=waiting,
+            removed=removed,
+            progress=progress,
+            max_blocks=self._max_blocks,
+            max_bytes=self._max_bytes,
+        )
+        after = await self._database.call(write)
+        del self._waiting[: len(waiting)]
+        self.progress = progress
+        if self._open_count != self._database.open_count:  # a damaged or deleted file was replaced by an empty one
+            self._open_count = self._database.open_count
+            self._changed.update(self._packs)
+        for pack, position in after.items():
+            entry = self._packs.get(pack)
+            if entry is packs[pack]:  # else a new store was begun meanwhile
+                self._count_lost(position.oldest - before[pack].oldest, "the store is full or damaged")
+                sent, oldest = max(position.sent, entry.position.sent), max(position.oldest, entry.position.oldest)
+                entry.position = position._replace(sent=sent, oldest=oldest)
+                entry.cursor = max(entry.cursor, oldest)
+                self._update_unsent(pack)
+
+    def _send(self, page: Page) -> Iterator[QueuedMessage]:
+        """Yield the messages of a page, unless the pack's cursor or store has changed while the page was read."""
+        pack, created_s, first, end = page.range
+        entry = self._packs.get(pack)
+        if entry is None or entry.position.created_s != created_s:
+            return
+        if entry.cursor == first:
+            entry.cursor = end
+            self._unsent.pop(pack, None)  # the other packs are next
+            self._update_unsent(pack)
+        elif end - first > 1:
+            return
+        if page.is_damaged:
+            self._changed.add(pack)
+        oldest = max(page.oldest, entry.position.oldest)
+        for number, data in page.blocks.items():
+            message = next(self._messages)
+            self._in_flight[message] = pack, number
+            payload = with_oldest(data, min(oldest, number))
+            yield QueuedMessage(message, Message(self._topic(pack), payload, 1, retain=False))
+
+    def _resend(self, entry: _Pack, number: int) -> None:
         """Send a block and all later blocks again, unless the block was resent less than ``resend_s`` ago."""
         now_s = asyncio.get_running_loop().time()
-        last_number, last_s = self._last_resend
-        if number >= self._cursor or (number == last_number and now_s - last_s < self._resend_s):
-            return
-        self._last_resend = number, now_s
-        self._cursor = max(number, self.oldest)
-        self._unacknowledged = {other for other in self._unacknowledged if other < self._cursor}
-        self._block_ready.set()
+        last_number, last_s = entry.last_resend
+        if number != last_number or now_s - last_s >= self._resend_s:
+            entry.last_resend = number, now_s
+            entry.cursor = entry.position.oldest
+            self.resends += 1
 
-    def _request_new_store(self, newer_than_s: int) -> None:
-        """Replace the store by one created after ``newer_than_s``, because a worker has later blocks than this disk.
+    def _begin_store(self, pack: str, other_ns: int) -> None:
+        """Replace the store of a pack by one created later than ``other_ns``, because a worker has later blocks than this disk.
 
         The disk may have been restored from a backup.
         """
-        if self._newer_than_s < newer_than_s < LATEST_S:
-            log.warning("a worker has later blocks than this store: a new store is begun", newer_than_s=newer_than_s)
-            self._newer_than_s = newer_than_s
-            self._sync_requested.set()
+        position, first_s = self.position(pack), math.ceil(other_ns / NS_PER_S) + 1
+        is_begun = not position.created_s and position.last_s >= first_s
+        if first_s > LATEST_S or is_begun:
+            return
+        log.warning("a worker has later blocks of this pack than this store: a new store is begun", pack=pack)
+        self._count_lost(position.next_number - position.oldest, "a new store is begun")
+        self.add_pack(pack, PackPosition(last_s=max(position.last_s, first_s)))
+        self._removed.add(pack)
+        self._changed.add(pack)
 
-    def _skip_damaged(self, first: int) -> None:
-        """Skip the unreadable blocks between the cursor and ``first``.
+    def _forget_sent(self, pack: str) -> None:
+        self._unsent.pop(pack, None)
+        self._in_flight = {message: sent for message, sent in self._in_flight.items() if sent[0] != pack}
 
-        They count as lost only if no earlier block is unconfirmed. Otherwise a worker will request them again.
-        """
-        if self.oldest >= self._cursor:
-            self._count_lost(first - self._cursor, "blocks on the disk are damaged")
-            self._first_unconfirmed = first
-        self._cursor = first
+    def _update_unsent(self, pack: str) -> None:
+        """List a pack for sending while it has blocks from its cursor on."""
+        entry = self._packs[pack]
+        if entry.cursor < entry.position.next_number:
+            self._unsent[pack] = None
+            self._block_ready.set()
+        else:
+            self._unsent.pop(pack, None)
 
     def _count_lost(self, blocks: int, reason: str) -> None:
-        if not self._loss_logged:
+        if blocks > 0 and not self._loss_logged:
             log.warning("blocks of samples are lost", reason=reason, blocks=blocks)
-        self._loss_logged = True
+            self._loss_logged = True
         self.dropped += blocks
-
-    async def _sync_repeatedly(self) -> None:
-        """Synchronize memory and disk on request, and retry after a failure."""
-        while not self._closing:
-            self._sync_requested.clear()
-            written = await self._sync()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(None if written else RETRY_S):
-                    await self._sync_requested.wait()
-        await self._sync()
-
-    async def _sync(self) -> bool:
-        """Synchronize memory and disk. Return False if the disk failed."""
-        waiting = list(self._waiting)
-        reopened = self._on_disk is None or self._open_count_at_sync != self._database.open_count
-        current_created_s = self._on_disk.state.created_s if self._on_disk else 0
-        transaction = StoreTransaction(
-            run_id=self._run_id,
-            waiting=waiting,
-            confirmed_below=self._first_unconfirmed,
-            current_created_s=current_created_s,
-            newer_than_s=self._newer_than_s,
-            max_bytes=self._max_bytes,
-            now_s=self._wall(),
-            recompute_bytes=reopened,
-        )
-        try:
-            result = await self._database.call(transaction)
-        except StoreError:
-            return False
-        self._open_count_at_sync = self._database.open_count
-        while self._waiting and waiting and self._waiting[0][0] <= waiting[-1][0]:
-            self._waiting.popleft()
-        self._apply_result(result)
-        return True
-
-    def _apply_result(self, result: StoreResult) -> None:
-        """Update the numbers in memory after a transaction."""
-        before, self._on_disk = self._on_disk, result
-        if before is None or before.state.created_s != result.state.created_s:
-            self._change_store(result, before)
-        if result.dropped:
-            self._count_lost(result.dropped, "the store is full")
-        else:
-            self._loss_logged = False
-        if result.oldest > self._cursor:
-            self._cursor = result.oldest
-            self._unacknowledged = {number for number in self._unacknowledged if number >= self._cursor}
-        self._block_ready.set()
-
-    def _change_store(self, result: StoreResult, before: StoreResult | None) -> None:
-        """Reset the numbers for a new store, and count the unconfirmed blocks of the previous store as lost."""
-        if before is not None:
-            self._count_lost(
-                before.state.next_number - max(before.oldest, self._first_unconfirmed), "a new store is begun"
-            )
-        self._first_unconfirmed = self._cursor = result.oldest
-        self._unacknowledged.clear()
-        log.info("store of blocks", made_s=result.state.created_s, next=result.state.next_number, oldest=result.oldest)

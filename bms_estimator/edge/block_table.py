@@ -1,20 +1,28 @@
-"""Tables of an edge's blocks, and the transactions on them."""
+"""Tables of the blocks that no worker has confirmed, for one pack or for many, and the transactions on them."""
 
+import math
 import sqlite3
-from collections.abc import Sequence
-from dataclasses import dataclass
+import zlib
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bms_estimator.edge.batching import ReadyBlock
-from bms_estimator.edge.block import MAX_NUMBER, Block, BlockError, decode, encode
+from bms_estimator.edge.block import HEADER_BYTES, MAX_NUMBER, Block, BlockError, decode_header, encode
 
 NS_PER_S = 1_000_000_000
 LATEST_S = MAX_NUMBER // NS_PER_S - 1
 """Latest creation time of a store, in the year 2262 [s since 1970]."""
-DROP_ROWS = 64
-"""Maximum number of rows that are read at a time when blocks are dropped."""
+MIN_CREATED_S = 1
+"""Earliest creation time of a store [s since 1970]; 0 means that a pack has no store yet."""
+_PACKS = """
+    CREATE TABLE pack (
+        name TEXT PRIMARY KEY, made_s INTEGER NOT NULL, next INTEGER NOT NULL, last_s REAL NOT NULL,
+        sent INTEGER NOT NULL, oldest INTEGER NOT NULL
+    ) WITHOUT ROWID;
+    CREATE TABLE progress (stream TEXT NOT NULL, sequence INTEGER NOT NULL);
+"""
 EDGE_TABLES = (
     """
     CREATE TABLE store (
@@ -27,195 +35,212 @@ EDGE_TABLES = (
     );
     CREATE TABLE block (number INTEGER PRIMARY KEY, data BLOB NOT NULL);
     """,
+    f"""
+    ALTER TABLE block ADD COLUMN pack TEXT NOT NULL DEFAULT ''; {_PACKS}
+    INSERT INTO pack SELECT '', made_s, next, made_s + last_s, 0, coalesce((SELECT min(number) FROM block), next) FROM store;
+    DROP TABLE store;
+    """,  # noqa: S608 - constant text
 )
-"""Statements that create the tables, one item for each version, in the format of ``store.migrations.MIGRATIONS``."""
-
-
-class StoreState(NamedTuple):
-    """Only row of table ``store``, in the order of its columns."""
-
-    created_s: int
-    """Creation time [s since 1970]: whole seconds, so that sample times relative to it are exact."""
-    next_number: int
-    """Number of the next block."""
-    last_s: float
-    """Time of the last sample since the creation of the store [s]; 0 without samples."""
-    bytes: int
-    """Total size of the blocks [bytes]."""
-    run_id: str
-    """Identifier of the process that inserted the last block."""
-    inserted_by_run: int
-    """Number of blocks that this process has inserted."""
-
-
-class StoreResult(NamedTuple):
-    """State of the store after a transaction."""
-
-    state: StoreState
-    """Row of table ``store``."""
-    oldest: int
-    """Number of the oldest block on disk; ``state.next_number`` without blocks."""
-    dropped: int
-    """Number of blocks dropped because the store was full."""
-
-
-@dataclass(frozen=True)
-class StoreTransaction:
-    """Idempotent transaction that inserts blocks, deletes confirmed ones and drops the oldest beyond the size limit.
-
-    Raises:
-        sqlite3.Error: The database cannot be read or written.
+"""Statements that create the tables of an edge, one item for each version, in the format of ``store.migrations.MIGRATIONS``.
+The name of its only pack is empty. The last version does not copy the blocks, because the disk may be full."""
+INGEST_TABLES = (
     """
-
-    run_id: str
-    """Identifier of this process, by which a repeated transaction skips blocks that were already inserted."""
-    waiting: Sequence[tuple[int, ReadyBlock]]
-    """Blocks to insert, with their running numbers in this process, from 1; sample times are seconds since 1970."""
-    confirmed_below: int
-    """Number below which blocks are deleted, because workers have confirmed them."""
-    current_created_s: int
-    """Creation time of the store that this process uses [s since 1970]; 0 if it has none yet. An older store on disk is
-    an outdated copy and is replaced."""
-    newer_than_s: int
-    """The store is replaced unless it was created after this time [s since 1970], because workers ignore blocks of a
-    store that is older than the newest that they know."""
-    max_bytes: int
-    """Maximum total size of the blocks on disk [bytes]."""
-    now_s: float
-    """Wall clock [s since 1970]."""
-    recompute_bytes: bool
-    """True to compute the total size of the blocks from the rows."""
-
-    def __call__(self, connection: sqlite3.Connection) -> StoreResult:
-        """Run the transaction."""
-        state = _stored_state(connection)
-        if state is None or state.created_s < self.current_created_s or state.created_s <= self.newer_than_s:
-            state = self._create_store(connection)
-        else:
-            removed = _total_bytes(connection, f"WHERE number < {self.confirmed_below:d}")
-            connection.execute("DELETE FROM block WHERE number < ?", (self.confirmed_below,))
-            state = state._replace(bytes=_total_bytes(connection) if self.recompute_bytes else state.bytes - removed)
-        inserted = state.inserted_by_run if state.run_id == self.run_id else 0
-        for running_number, ready in self.waiting:
-            if running_number > inserted:
-                state = _insert(connection, state, ready)._replace(run_id=self.run_id, inserted_by_run=running_number)
-        state, dropped = _drop_excess(connection, state, self.max_bytes)
-        connection.execute("DELETE FROM store")
-        connection.execute("INSERT INTO store VALUES (?, ?, ?, ?, ?, ?)", state)
-        (oldest,) = connection.execute("SELECT min(number) FROM block").fetchone()
-        return StoreResult(state, state.next_number if oldest is None else oldest, dropped)
-
-    def _create_store(self, connection: sqlite3.Connection) -> StoreState:
-        """Create a store, stamped with the time of its first waiting sample."""
-        connection.execute("DELETE FROM block")
-        first_s = float(self.waiting[0][1].samples["time_s"][0]) if self.waiting else self.now_s
-        return StoreState(
-            created_s=max(int(first_s), self.current_created_s + 1, self.newer_than_s + 1),
-            next_number=1,
-            last_s=0.0,
-            bytes=0,
-            run_id="",
-            inserted_by_run=0,
-        )
+    CREATE TABLE pack (
+        name TEXT PRIMARY KEY, made_s INTEGER NOT NULL, next INTEGER NOT NULL, last_s REAL NOT NULL
+    ) WITHOUT ROWID;
+    CREATE TABLE block (
+        id INTEGER PRIMARY KEY AUTOINCREMENT, pack TEXT NOT NULL, number INTEGER NOT NULL, data BLOB NOT NULL
+    );
+    CREATE UNIQUE INDEX block_number ON block (pack, number);
+    CREATE TABLE progress (stream TEXT NOT NULL, sequence INTEGER NOT NULL, sent INTEGER NOT NULL);
+    """,
+    f"""
+    ALTER TABLE pack RENAME TO former_pack; ALTER TABLE progress RENAME TO former_progress; {_PACKS}
+    INSERT INTO pack SELECT name, made_s, next, last_s,
+        coalesce((SELECT max(number) FROM block WHERE pack = name AND id <= (SELECT sent FROM former_progress)), 0),
+        coalesce((SELECT min(number) FROM block WHERE pack = name), next) FROM former_pack;
+    INSERT INTO progress SELECT stream, sequence FROM former_progress;
+    DROP TABLE former_pack;
+    DROP TABLE former_progress;
+    """,  # noqa: S608 - constant text
+)
+"""Statements that create the tables of ``fleet ingest``. The last version of both has the same columns."""
 
 
-class Page(NamedTuple):
-    """Consecutive blocks read from disk."""
+class PackPosition(NamedTuple):
+    """Row of table ``pack``: position of a pack in the blocks of its store."""
 
-    first: int
-    """Number of the first block of the page. Without blocks, all blocks before this number are damaged or missing."""
-    blocks: list[tuple[int, bytes]]
-    """Numbers and encoded blocks."""
+    created_s: int = 0
+    """Creation time of the store [s since 1970]: whole seconds, so that sample times relative to it are exact. 0 before the
+    first block, which creates the store at the time of its first sample."""
+    next_number: int = 1
+    """Number of the next block."""
+    last_s: float = -math.inf
+    """Time of the last sample in a block [s since 1970]. Later blocks begin at this time or later."""
+    sent: int = 0
+    """Largest number of a block that the server has acknowledged."""
+    oldest: int = 1
+    """Number of the oldest block that can still be sent; ``next_number`` without one."""
 
 
-@dataclass(frozen=True)
-class PageRead:
-    """Transaction that reads consecutive undamaged blocks. Damaged blocks before the first of them are skipped.
+class Progress(NamedTuple):
+    """Only row of table ``progress``, which an edge does not use."""
+
+    stream: str = ""
+    """Creation time of the stream ``TELEMETRY``, which identifies it."""
+    sequence: int = 0
+    """Stream sequence number up to which all accepted samples are in stored blocks."""
+
+
+def read_state(connection: sqlite3.Connection) -> tuple[Progress, dict[str, PackPosition]]:
+    """Return the progress, and the valid positions by pack.
 
     Raises:
         sqlite3.Error: The database cannot be read.
     """
+    row = connection.execute("SELECT stream, sequence FROM progress").fetchone()
+    rows = connection.execute("SELECT name, made_s, next, last_s, sent, oldest FROM pack")
+    packs = {name: PackPosition(*position) for name, *position in rows if _is_position(position)}
+    return Progress(*row) if row else Progress(), packs
 
+
+def _is_position(row: Sequence[Any]) -> bool:
+    if [*map(type, row)] != [int, int, float, int, int]:
+        return False
+    position = PackPosition(*row)
+    is_plausible = 0 <= position.created_s <= LATEST_S and 1 <= position.oldest <= position.next_number < MAX_NUMBER
+    return is_plausible and 0 <= position.sent < position.next_number
+
+
+def write_changes(
+    connection: sqlite3.Connection,
+    positions: Mapping[str, PackPosition],
+    waiting: Sequence[tuple[str, ReadyBlock]],
+    removed: Collection[str],
+    progress: Progress,
+    *,
+    max_blocks: int,
+    max_bytes: float,
+) -> dict[str, PackPosition]:
+    """Insert blocks with numbers, and delete blocks that are confirmed or exceed a limit. A repetition has no further effect.
+
+    Args:
+        connection: Connection with an open transaction.
+        positions: Positions before ``waiting`` of all packs that have changed. Blocks before ``oldest`` are deleted.
+        waiting: Blocks to insert, by pack; sample times are seconds since 1970.
+        removed: Packs whose blocks and position are removed, before blocks are inserted.
+        progress: New content of table ``progress``.
+        max_blocks: Maximum number of stored blocks of a pack.
+        max_bytes: Maximum size of the database [bytes]. The newest block is always kept.
+
+    Returns:
+        The positions after the transaction.
+
+    Raises:
+        sqlite3.Error: The database cannot be written.
+    """
+    for pack in removed:
+        connection.execute("DELETE FROM block WHERE pack = ?", (pack,))
+        connection.execute("DELETE FROM pack WHERE name = ?", (pack,))
+    after = dict(positions)
+    for pack, ready in waiting:
+        after[pack] = _insert(connection, pack, after[pack], ready)
+    first = [(pack, max(at.oldest, at.next_number - max_blocks)) for pack, at in after.items()]
+    connection.executemany("DELETE FROM block WHERE pack = ? AND number < ?", first)
+    oldest = "DELETE FROM block WHERE rowid = (SELECT min(rowid) FROM block) AND rowid < (SELECT max(rowid) FROM block)"
+    while _used_bytes(connection) > max_bytes and connection.execute(oldest).rowcount:
+        pass
+    after = {pack: at._replace(oldest=_oldest(connection, pack, at.next_number)) for pack, at in after.items()}
+    rows = ((pack, *position) for pack, position in after.items())
+    connection.executemany("INSERT OR REPLACE INTO pack VALUES (?, ?, ?, ?, ?, ?)", rows)
+    connection.execute("DELETE FROM progress")
+    connection.execute("INSERT INTO progress VALUES (?, ?)", progress)
+    return after
+
+
+class BlockRange(NamedTuple):
+    """Successive blocks of a pack."""
+
+    pack: str
     created_s: int
     """Creation time of the store [s since 1970]."""
     first: int
     """Number of the first block."""
     end: int
     """Number after the last block."""
-    max_blocks: int
-    """Maximum number of blocks."""
-
-    def __call__(self, connection: sqlite3.Connection) -> Page:
-        """Run the transaction."""
-        query = "SELECT number, data FROM block WHERE number >= ? AND number < ? ORDER BY number LIMIT ?"
-        blocks = list[tuple[int, bytes]]()
-        first_undamaged = self.end
-        for number, data in connection.execute(query, (self.first, self.end, self.max_blocks)).fetchall():
-            if not _is_valid(self.created_s, number, data):
-                if blocks:
-                    break
-                first_undamaged = number + 1
-            elif blocks and number != blocks[-1][0] + 1:
-                break
-            else:
-                blocks.append((number, data))
-        return Page(blocks[0][0] if blocks else first_undamaged, blocks)
 
 
-def _stored_state(connection: sqlite3.Connection) -> StoreState | None:
-    """Read the existing store; None if it is not valid."""
-    row = connection.execute("SELECT made_s, next, last_s, bytes, run, taken FROM store").fetchone()
-    if row is None or [*map(type, row)] != [int, int, float, int, str, int]:
-        return None
-    state = StoreState(*row)
-    return state if 0 < state.created_s <= LATEST_S and 0 < state.next_number < MAX_NUMBER else None
+class Page(NamedTuple):
+    """Undamaged blocks of a range, read from disk."""
+
+    range: BlockRange
+    """Blocks that were looked up."""
+    blocks: dict[int, bytes]
+    """Encoded blocks by number."""
+    is_damaged: bool
+    """True if damaged blocks were deleted."""
+    oldest: int
+    """Number of the pack's oldest block on disk; ``range.end`` without one."""
 
 
-def _insert(connection: sqlite3.Connection, state: StoreState, ready: ReadyBlock) -> StoreState:
+def read_pages(connection: sqlite3.Connection, ranges: Sequence[BlockRange], max_blocks: int) -> list[Page]:
+    """Return at most ``max_blocks`` blocks, and delete damaged ones among them. Pages of the last ranges may be missing.
+
+    Raises:
+        sqlite3.Error: The database cannot be read or written.
+    """
+    pages, left = list[Page](), max_blocks
+    query = "SELECT number, data FROM block WHERE pack = ? AND number >= ? AND number < ? ORDER BY number LIMIT ?"
+    for each in ranges:
+        rows = connection.execute(query, (each.pack, each.first, each.end, left)).fetchall()
+        blocks = {number: data for number, data in rows if _is_valid(each.created_s, number, data)}
+        damaged = [(each.pack, number) for number, _ in rows if number not in blocks]
+        connection.executemany("DELETE FROM block WHERE pack = ? AND number = ?", damaged)
+        looked_up = each if len(rows) < left else each._replace(end=rows[-1][0] + 1)
+        pages.append(Page(looked_up, blocks, bool(damaged), _oldest(connection, each.pack, each.end)))
+        left -= len(rows)
+        if not left:
+            break
+    return pages
+
+
+def _insert(connection: sqlite3.Connection, pack: str, position: PackPosition, ready: ReadyBlock) -> PackPosition:
+    """Insert the next block of a pack, and return the position after it."""
     samples = ready.samples.copy()
     # sample times never decrease within a store, even if the clock was set back before a restart
-    samples["time_s"] = np.maximum(samples["time_s"] - state.created_s, state.last_s)
-    block = Block(
-        store_created_ns=state.created_s * NS_PER_S,
-        number=state.next_number,
-        oldest=state.next_number,  # replaced by the oldest number at the time of sending
-        arrival_s=ready.arrival_s,
-        samples=samples,
-        cells_v=ready.cells_v,
+    times_s = np.maximum(samples["time_s"], max(position.last_s, MIN_CREATED_S))
+    created_s = position.created_s or int(times_s[0])
+    samples["time_s"] = times_s - created_s
+    number = position.next_number
+    oldest = number  # replaced by the oldest number at the time of sending
+    block = Block(created_s * NS_PER_S, number, oldest, ready.arrival_s, samples, ready.cells_v)
+    insert = "INSERT OR REPLACE INTO block (pack, number, data) VALUES (?, ?, ?)"
+    connection.execute(insert, (pack, number, encode(block)))
+    return position._replace(created_s=created_s, next_number=number + 1, last_s=float(times_s[-1]))
+
+
+def _used_bytes(connection: sqlite3.Connection) -> int:
+    """Return the size of the database without free pages [bytes]."""
+    pages, free, page_bytes = (
+        connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "freelist_count", "page_size")
     )
-    data = encode(block)
-    connection.execute("INSERT OR REPLACE INTO block VALUES (?, ?)", (state.next_number, data))
-    last_s = float(samples["time_s"][-1])
-    return state._replace(next_number=state.next_number + 1, last_s=last_s, bytes=state.bytes + len(data))
+    return int((pages - free) * page_bytes)
 
 
-def _drop_excess(connection: sqlite3.Connection, state: StoreState, max_bytes: int) -> tuple[StoreState, int]:
-    """Drop the oldest blocks beyond the size limit, but never the newest one."""
-    dropped = 0
-    oldest = "SELECT number, length(data) FROM block WHERE number < ? ORDER BY number LIMIT ?"
-    while state.bytes > max_bytes and (
-        rows := connection.execute(oldest, (state.next_number - 1, DROP_ROWS)).fetchall()
-    ):
-        for number, size in rows:
-            if state.bytes <= max_bytes:
-                break
-            connection.execute("DELETE FROM block WHERE number = ?", (number,))
-            state = state._replace(bytes=state.bytes - size)
-            dropped += 1
-    return state, dropped
-
-
-def _total_bytes(connection: sqlite3.Connection, condition: str = "") -> int:
-    (size,) = connection.execute(f"SELECT coalesce(sum(length(data)), 0) FROM block {condition}").fetchone()  # noqa: S608 - constant text and an integer
-    return int(size)
+def _oldest(connection: sqlite3.Connection, pack: str, end: int) -> int:
+    """Return the number of a pack's oldest block before the number ``end``; ``end`` without one."""
+    query = "SELECT coalesce(min(number), ?) FROM block WHERE pack = ? AND number < ?"
+    (oldest,) = connection.execute(query, (end, pack, end)).fetchone()
+    return int(oldest)
 
 
 def _is_valid(created_s: int, number: int, data: Any) -> bool:
-    """Return True if a row holds the undamaged block of its number."""
+    """Return True if a row holds the undamaged block of its number, by its header and the checksum of its body."""
     if not isinstance(data, bytes):
         return False
     try:
-        block = decode(data)
-    except BlockError:
+        header = decode_header(data)
+        zlib.decompress(data[HEADER_BYTES:])
+    except (BlockError, zlib.error):
         return False
-    return block.store_created_ns == created_s * NS_PER_S and block.number == number
+    return header.store_created_ns == created_s * NS_PER_S and header.number == number

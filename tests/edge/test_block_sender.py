@@ -1,17 +1,14 @@
 """Block sender with a real server. After each kind of fault the received samples equal those sent, in order."""
 
 import asyncio
-import contextlib
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
-import nats
 import numpy as np
 import pytest
 
-from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
-from bms_estimator.edge.block_sender import BlockSender
+from bms_estimator.edge.block_sender import PACK, BlockSender
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.model.clock import Clock
@@ -107,7 +104,7 @@ async def test_samples_arrive_in_blocks_of_a_minute_and_the_rest_arrives_at_shut
     async with simulated.edge:
         simulated.add(30.5)
         await receiver.wait_for_samples(30 * 60)
-        await until(lambda: simulated.edge.store.oldest > 20)  # the worker has confirmed 20 blocks
+        await until(lambda: simulated.edge.store.position(PACK).oldest > 20)  # the worker has confirmed 20 blocks
     await simulated.assert_all_received()
     assert [block.number for block in receiver.blocks] == list(range(1, 32))
     assert {block.samples.size for block in receiver.blocks[:-1]} == {60}
@@ -141,9 +138,8 @@ async def test_samples_keep_their_period_if_a_new_store_begins_later_than_the_wa
         simulated.add(2)
         # a worker that has received blocks of a later store makes the edge begin a store that is later still
         later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
-        await until(lambda: simulated.edge.store._on_disk.state.next_number == 2)  # the first block is on disk
-        simulated.edge.store.on_request(later)
-        await until(lambda: simulated.edge.store.last_s > WALL_S + 1e8)
+        await until(lambda: simulated.edge.store.position(PACK).next_number == 2)  # the first block is on disk
+        simulated.edge.store.on_request(PACK, later)
         simulated.add(4)
         async with asyncio.timeout(LONG_S):
             first, second, third = [decode((await simulated.edge.store.take(1))[0].message.payload) for _ in range(3)]
@@ -253,21 +249,3 @@ async def test_open_block_is_sent_if_the_source_falls_silent(
 async def test_unreadable_password_file_is_a_user_error(engine: NatsCluster, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"^edge.password_file = /none: cannot be read"):
         BlockSender(EdgeSettings(username="a", password_file=Path("/none")), "pack", tmp_path)
-
-
-async def test_stream_stores_blocks_under_a_subject_of_the_pack(
-    receiver: Receiver, engine: NatsCluster, tmp_path: Path
-) -> None:
-    simulated = SimulatedEdge(receiver, tmp_path, url(engine))
-    async with simulated.edge:
-        simulated.add(2)
-        await receiver.wait_for_samples(60)
-    async with contextlib.AsyncExitStack() as stack:
-        nc = await nats.connect(engine.url)
-        stack.push_async_callback(nc.close)
-        stream = await nc.jetstream().stream_info(
-            subjects.RAW_STREAM,
-            subjects_filter=subjects.stored_raw(0).replace("0", "*", 1),  # all partitions
-        )
-        assert stream.state.subjects
-        assert sum(name.endswith(f".raw.{receiver.pack}") for name in stream.state.subjects) == 1

@@ -6,7 +6,7 @@ import os
 import sqlite3
 import subprocess
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +14,18 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.edge.batching import ReadyBlock
-from bms_estimator.edge.block import Block, decode
+from bms_estimator.edge.block import Block, decode, encode
+from bms_estimator.edge.block_sender import PACK
 from bms_estimator.edge.block_store import BlockStore
-from bms_estimator.edge.block_table import EDGE_TABLES, NS_PER_S
+from bms_estimator.edge.block_table import EDGE_TABLES, INGEST_TABLES, NS_PER_S
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.arrays import SAMPLE
-from bms_estimator.store.database import Database
-from tests.patience import LONG_S, until
+from bms_estimator.store.database import Database, StoreError
+from bms_estimator.store.migrations import migrate
+from tests.patience import LONG_S
 
 WALL_S = 1.7e9
 """Wall clock at the creation of the store [s since 1970]."""
-UNLIMITED_BYTES = 1 << 30
-"""Size limit that no test reaches [bytes]."""
 
 
 def block_at(at_s: float, count: int = 5) -> ReadyBlock:
@@ -37,31 +37,38 @@ def block_at(at_s: float, count: int = 5) -> ReadyBlock:
 
 
 @contextlib.asynccontextmanager
-async def open_store(path: Path, max_bytes: int = UNLIMITED_BYTES, wall_s: float = WALL_S) -> AsyncIterator[BlockStore]:
-    """Open the store of blocks at ``path``, with a wall clock that stands at ``wall_s``."""
-    database = Database(path, tables=EDGE_TABLES, sync_s=0.0, retry_s=0.0)
-    store = BlockStore(database, "raw/pack", max_bytes, wall=lambda: wall_s, resend_s=0.0)
-    async with database, store:
+async def open_store(path: Path, tables: tuple[str, ...] = EDGE_TABLES, **limits: float) -> AsyncIterator[BlockStore]:
+    """Open the store of blocks at ``path`` with some limits."""
+    async with Database(path, tables=tables, sync_s=0.0, retry_s=0.0) as database:
+        store = BlockStore(database, "raw/{}".format, **{"resend_s": 0.0} | limits)
+        await store.sync()
         yield store
+        await store.sync()
 
 
-async def write_blocks(store: BlockStore, *blocks: ReadyBlock) -> None:
-    """Put blocks into the store and wait until they are on disk."""
+async def write_blocks(store: BlockStore, *blocks: ReadyBlock, pack: str = PACK) -> None:
+    """Write blocks to disk."""
     for block in blocks:
-        store.put(block)
-    await until(lambda: not store._waiting)
+        store.put(pack, block)
+    assert await store.sync()
 
 
-async def take(store: BlockStore, count: int) -> list[Block]:
-    """Return the next ``count`` blocks to be sent, after a check of topic and numbers of their messages."""
+async def take(store: BlockStore, count: int, pack: str = PACK) -> list[Block]:
+    """Return the next ``count`` blocks of a pack to be sent, which the broker does not acknowledge."""
     blocks = list[Block]()
     async with asyncio.timeout(LONG_S):
         while len(blocks) < count:
             messages = await store.take(count - len(blocks))
-            assert {waiting.message.topic for waiting in messages} == {"raw/pack"}
-            blocks += [decode(waiting.message.payload) for waiting in messages]
-            assert [waiting.number for waiting in messages] == [block.number for block in blocks[-len(messages) :]]
+            assert {queued.message.topic for queued in messages} == {f"raw/{pack}"}
+            blocks += [decode(queued.message.payload) for queued in messages]
     return blocks
+
+
+def acknowledge(store: BlockStore, *blocks: int) -> None:
+    """Acknowledge blocks in flight, by their numbers."""
+    for message, (_, number) in list(store._in_flight.items()):
+        if number in blocks:
+            store.acknowledge(message)
 
 
 def numbers(blocks: list[Block]) -> list[int]:
@@ -86,49 +93,87 @@ async def test_blocks_are_taken_in_order_with_times_relative_to_the_store(tmp_pa
             assert (block.samples["voltage_v"] == original.samples["voltage_v"]).all()
 
 
-async def test_restarted_edge_continues_numbers_and_time_of_the_store_and_sends_unconfirmed_blocks(
+async def test_restarted_edge_continues_numbers_and_time_of_the_store_and_sends_unacknowledged_blocks(
     tmp_path: Path,
 ) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(6))
-        for block in await take(store, 6):
-            store.acknowledge(block.number)
-        store.on_request(BlockRequest(store=int(WALL_S) * NS_PER_S, number=4, resend=False))
-        assert (store.waiting, store.unconfirmed) == (0, 3)
-    async with open_store(tmp_path / "s.sqlite", wall_s=WALL_S - 1e8) as store:
-        assert store.last_s == WALL_S + 304.0  # five samples from 300 s on
+        await take(store, 6)
+        acknowledge(store, 1, 2, 3, 4)
+        store.on_request(PACK, BlockRequest(store=int(WALL_S) * NS_PER_S, number=4, resend=False))
+        assert (store.waiting, store.unconfirmed) == (2, 3)
+    async with open_store(tmp_path / "s.sqlite") as store:
+        assert store.position(PACK).last_s == WALL_S + 304.0  # five samples from 300 s on
         await write_blocks(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
-        blocks = await take(store, 4)
-    assert numbers(blocks) == [4, 5, 6, 7]
+        blocks = await take(store, 3)
+    assert numbers(blocks) == [5, 6, 7]
     assert {block.store_created_ns for block in blocks} == {int(WALL_S) * NS_PER_S}
     assert {block.oldest for block in blocks} == {4}
     assert blocks[-1].samples["time_s"].tolist() == [304.0] * 5
 
 
 async def test_full_store_drops_its_oldest_blocks_and_announces_the_oldest_remaining_one(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minute_blocks(1))
-        max_bytes = int(10.5 * store._on_disk.state.bytes)  # ten blocks and a half
-    async with open_store(tmp_path / "s.sqlite", max_bytes=max_bytes) as store:
+    async with open_store(tmp_path / "s.sqlite", max_bytes=60_000) as store:
         with capture_logs() as lines:
-            for block in minute_blocks(60, first=1):
-                await write_blocks(store, block)
-        assert [line["reason"] for line in lines if "lost" in line["event"]] == ["the store is full"]
-        assert store._on_disk.state.bytes <= max_bytes
-        remaining = store.unconfirmed  # of the blocks 1 to 61
-        assert store.dropped == 61 - remaining
+            for i in range(400):
+                await write_blocks(store, block_at(WALL_S + 60.0 * i, count=50))
+        assert [line["reason"] for line in lines if "lost" in line["event"]] == ["the store is full or damaged"]
+        remaining = store.unconfirmed
+        assert store.dropped == 400 - remaining
         blocks = await take(store, remaining)
-        assert numbers(blocks) == list(range(62 - remaining, 62))
-        assert {block.oldest for block in blocks} == {62 - remaining}
-        assert 8 <= remaining <= 11  # the sizes of compressed blocks differ
+        assert numbers(blocks) == list(range(401 - remaining, 401))
+        assert {block.oldest for block in blocks} == {401 - remaining}
+        payload_bytes = sum(len(encode(block)) for block in blocks)
+        assert 30_000 < payload_bytes <= 60_000  # the rest are fractions of pages
+
+
+async def test_oldest_blocks_of_a_pack_beyond_its_limit_are_dropped_and_those_of_others_stay(tmp_path: Path) -> None:
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES, max_blocks=2) as store:
+        await write_blocks(store, *minute_blocks(2), pack="a")
+        await write_blocks(store, *minute_blocks(5), pack="b")
+        assert (store.unconfirmed_of("a"), store.unconfirmed_of("b"), store.dropped) == (2, 2, 3)
+        assert numbers(await take(store, 2, "a")) == [1, 2]
+        assert numbers(await take(store, 2, "b")) == [4, 5]
+        store.remove("b")
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+        assert (store.packs, store.unconfirmed) == (["a"], 2)
+
+
+async def test_resend_of_a_pack_does_not_delay_the_others(tmp_path: Path) -> None:
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+        for pack in ("a", "b"):
+            await write_blocks(store, *minute_blocks(4), pack=pack)
+            await take(store, 4, pack)
+        store.on_request("a", BlockRequest(store=int(WALL_S) * NS_PER_S, number=2, resend=True))
+        await write_blocks(store, *minute_blocks(1, first=4), pack="b")
+        assert numbers(await take(store, 1, "a")) == [2]
+        assert numbers(await take(store, 1, "b")) == [5]
+        store.repeat("b", 3)
+        assert numbers(await take(store, 1, "b")) == [3]
+        assert numbers(await take(store, 2, "a")) == [3, 4]
+
+
+async def test_transaction_whose_result_is_unknown_is_repeated_without_effect(tmp_path: Path) -> None:
+    async with open_store(tmp_path / "s.sqlite") as store:
+        call = store._database.call
+
+        async def call_without_result(work: Callable[[sqlite3.Connection], object]) -> None:
+            await call(work)
+            raise StoreError("the disk has not answered")
+
+        store._database.call = call_without_result
+        store.put(PACK, minute_blocks(1)[0])
+        assert not await store.sync()
+        store._database.call = call
+        await write_blocks(store, *minute_blocks(1, first=1))
+        assert numbers(await take(store, 2)) == [1, 2]
 
 
 async def test_blocks_that_the_broker_has_not_acknowledged_are_taken_again_after_a_rewind(tmp_path: Path) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(6))
         await take(store, 5)
-        for number in (1, 2, 4):
-            store.acknowledge(number)
+        acknowledge(store, 1, 2, 4)
         store.rewind()
         assert numbers(await take(store, 4)) == [3, 4, 5, 6]
 
@@ -137,7 +182,7 @@ async def test_resend_request_repeats_the_requested_block_and_all_later_ones(tmp
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(8))
         await take(store, 8)
-        store.on_request(BlockRequest(store=int(WALL_S) * NS_PER_S, number=3, resend=True))
+        store.on_request(PACK, BlockRequest(store=int(WALL_S) * NS_PER_S, number=3, resend=True))
         blocks = await take(store, 6)
         assert (numbers(blocks), {block.oldest for block in blocks}) == ([3, 4, 5, 6, 7, 8], {3})
 
@@ -148,9 +193,9 @@ async def test_repeated_resend_request_is_ignored_within_the_resend_interval(tmp
         await write_blocks(store, *minute_blocks(8))
         await take(store, 8)
         request = BlockRequest(store=int(WALL_S) * NS_PER_S, number=3, resend=True)
-        store.on_request(request)
+        store.on_request(PACK, request)
         await take(store, 6)
-        store.on_request(request)
+        store.on_request(PACK, request)
         await write_blocks(store, *minute_blocks(1, first=8))
         assert numbers(await take(store, 1)) == [9]
 
@@ -170,8 +215,7 @@ async def test_request_for_blocks_later_than_those_on_disk_begins_a_new_store(
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(3))
         await take(store, 3)
-        store.on_request(block_request)
-        await until(lambda: store._on_disk.state.created_s * NS_PER_S > block_request.store)
+        store.on_request(PACK, block_request)
         await write_blocks(store, block_at(WALL_S + 1000.0))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest) == (1, 1)
@@ -184,9 +228,49 @@ async def test_request_for_blocks_later_than_those_on_disk_begins_a_new_store(
 async def test_request_with_an_implausible_store_is_ignored(tmp_path: Path, store_ns: int) -> None:
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(3))
-        store.on_request(BlockRequest(store=store_ns, number=1 << 63, resend=True))
+        store.on_request(PACK, BlockRequest(store=store_ns, number=1 << 63, resend=True))
         await write_blocks(store, *minute_blocks(1, first=3))
         assert numbers(await take(store, 4)) == [1, 2, 3, 4]
+
+
+def encoded(number: int) -> bytes:
+    """Return a block of the version before, encoded for the store of ``WALL_S``."""
+    samples = block_at(60.0 * (number - 1)).samples
+    return encode(Block(int(WALL_S) * NS_PER_S, number, number, WALL_S, samples))
+
+
+async def test_unsent_blocks_of_an_edge_of_the_version_before_are_sent(tmp_path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(tmp_path / "s.sqlite", isolation_level=None)) as connection:
+        migrate(connection, EDGE_TABLES[:1])
+        connection.executemany("INSERT INTO block VALUES (?, ?)", [(number, encoded(number)) for number in (3, 4)])
+        connection.execute("INSERT INTO store VALUES (?, 5, 184.0, 999, 'run', 4)", (int(WALL_S),))
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, block_at(WALL_S))
+        blocks = await take(store, 3)
+    assert numbers(blocks) == [3, 4, 5]
+    assert {(block.store_created_ns, block.oldest) for block in blocks} == {(int(WALL_S) * NS_PER_S, 3)}
+    assert blocks[-1].samples["time_s"].tolist() == [184.0] * 5
+
+
+async def test_unsent_blocks_and_progress_of_ingest_of_the_version_before_are_read(tmp_path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(tmp_path / "s.sqlite", isolation_level=None)) as connection:
+        migrate(connection, INGEST_TABLES[:1])
+        rows = [("a", 3), ("b", 1), ("a", 4), ("a", 5)]
+        insert = "INSERT INTO block (pack, number, data) VALUES (?, ?, ?)"
+        connection.executemany(insert, [(pack, number, encoded(number)) for pack, number in rows])
+        packs = [
+            ("a", int(WALL_S), 6, WALL_S + 244.0),
+            ("b", int(WALL_S), 2, WALL_S + 4.0),
+            ("c", int(WALL_S), 9, WALL_S),
+        ]
+        connection.executemany("INSERT INTO pack VALUES (?, ?, ?, ?)", packs)
+        connection.execute("INSERT INTO progress VALUES ('now', 77, 3)")  # three blocks were acknowledged
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+        assert store.progress == ("now", 77)
+        assert [store.unconfirmed_of(pack) for pack in store.packs] == [3, 1, 0]
+        await write_blocks(store, block_at(WALL_S + 300.0), pack="b")
+        assert numbers(await take(store, 1, "a")) == [5]
+        assert numbers(await take(store, 1, "b")) == [2]
 
 
 @pytest.mark.parametrize("damage", ["no database", "deleted", "other tables", "row"])
@@ -194,19 +278,24 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
     path = tmp_path / "s.sqlite"
     async with open_store(path) as store:
         await write_blocks(store, *minute_blocks(3))
-        created_s = store._on_disk.state.created_s
+        created_s = store.position(PACK).created_s
     if damage == "no database":
         path.write_bytes(b"not an SQLite file" * 1000)
     elif damage == "deleted":
         path.unlink()
     else:
         with contextlib.closing(sqlite3.connect(path)) as connection:
-            connection.execute("DROP TABLE block" if damage == "other tables" else "UPDATE store SET next = 'x'")
+            connection.execute("DROP TABLE block" if damage == "other tables" else "UPDATE pack SET next = 'x'")
             connection.commit()
     with capture_logs() as lines:
-        async with open_store(path, wall_s=WALL_S + 500.0) as store:
+        async with open_store(path) as store:
             await write_blocks(store, block_at(WALL_S + 500.0))
             (block,) = await take(store, 1)
+            store.on_request(PACK, BlockRequest(store=block.store_created_ns, number=2, resend=False))
+            await write_blocks(
+                store, block_at(WALL_S + 560.0)
+            )  # whether or not later blocks of the former store remain
+            assert numbers(await take(store, 1)) == [2]
     assert block.store_created_ns > created_s * NS_PER_S
     assert block.number == 1
     quarantined = [line for line in lines if line["event"] == "database set aside, a new one is begun"]
@@ -215,16 +304,17 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
 
 
 async def test_file_deleted_while_in_use_loses_only_the_blocks_written_before(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
-        await write_blocks(store, *minute_blocks(3))
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+        await write_blocks(store, *minute_blocks(3), pack="a")
+        await write_blocks(store, *minute_blocks(1), pack="b")
         (tmp_path / "s.sqlite").unlink()
-        await write_blocks(store, *minute_blocks(2, first=3))
-        blocks = await take(store, 2)
-        assert numbers(blocks) == [1, 2]
-        assert (
-            blocks[0].store_created_ns == (int(WALL_S) + 180) * NS_PER_S
-        )  # created at the first block after the deletion
-        assert blocks[0].samples["time_s"][0] == 0.0
+        await write_blocks(store, *minute_blocks(2, first=3), pack="a")
+        blocks = await take(store, 2, "a")
+        assert (numbers(blocks), {block.oldest for block in blocks}) == ([4, 5], {4})
+        assert store.dropped == 3
+        await store.sync()
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+        assert {pack: store.position(pack).next_number for pack in store.packs} == {"a": 6, "b": 2}
 
 
 async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
@@ -232,16 +322,19 @@ async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
     async with open_store(path) as store:
         await write_blocks(store, *minute_blocks(6))
     with contextlib.closing(sqlite3.connect(path)) as connection:
-        connection.execute("UPDATE block SET data = zeroblob(200) WHERE number IN (1, 4)")
+        connection.execute("UPDATE block SET data = zeroblob(200) WHERE number = 1")
+        connection.execute("UPDATE block SET data = substr(data, 1, 60) WHERE number = 4")
         connection.execute("DELETE FROM block WHERE number = 5")
         connection.commit()
     async with open_store(path) as store:
         blocks = await take(store, 3)
         assert numbers(blocks) == [2, 3, 6]
         assert {block.oldest for block in blocks} == {2}  # block 2 is not yet confirmed and can be sent again
-        store.on_request(BlockRequest(store=blocks[0].store_created_ns, number=2, resend=True))
+        await store.sync()
+        store.on_request(PACK, BlockRequest(store=blocks[0].store_created_ns, number=2, resend=True))
         assert numbers(await take(store, 3)) == [2, 3, 6]
-        store.on_request(BlockRequest(store=blocks[0].store_created_ns, number=4, resend=True))
+        store.on_request(PACK, BlockRequest(store=blocks[0].store_created_ns, number=4, resend=True))
+        await store.sync()
         (block,) = await take(store, 1)
         assert (block.number, block.oldest, store.dropped) == (6, 6, 3)  # 1, 4 and 5 are lost
 
@@ -249,22 +342,22 @@ async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
 async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(full_disk: Path) -> None:
     async with open_store(full_disk / "s.sqlite") as store:
         for block in minute_blocks(3):
-            store.put(block)
-        await until(lambda: store._database.failure_reason)
+            store.put(PACK, block)
+        assert not await store.sync()
         assert (store.unconfirmed, store.waiting) == (3, 3)
         (full_disk / "file").unlink()
         await asyncio.to_thread(subprocess.run, ["mount", "-o", "remount,size=10m", full_disk], check=True)
-        blocks = await take(store, 3)
-        assert numbers(blocks) == [1, 2, 3]
+        assert await store.sync()
+        assert numbers(await take(store, 3)) == [1, 2, 3]
 
 
 async def test_memory_is_bounded_while_the_disk_fails(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("a file in place of the folder")
-    async with open_store(tmp_path / "file" / "s.sqlite") as store:
+    async with open_store(tmp_path / "file" / "s.sqlite", max_waiting=500_000) as store:
         for i in range(60):
-            store.put(block_at(WALL_S + 60.0 * i, count=20_000))
-        assert store.unconfirmed == 25  # 500,000 samples, the limit of memory
-        assert store.dropped == 35
+            store.put(PACK, block_at(WALL_S + 60.0 * i, count=20_000))
+        assert not await store.sync()
+        assert (store.unconfirmed, store.dropped) == (25, 35)
 
 
 WRITER_SCRIPT = """
@@ -275,7 +368,7 @@ async def main():
     async with open_store(Path(sys.argv[1])) as store:
         for block in minute_blocks(10_000):
             await write_blocks(store, block)
-            print(store._on_disk.state.next_number, file=sys.stderr, flush=True)
+            print(store.position('').next_number, file=sys.stderr, flush=True)
 asyncio.run(main())
 """
 
@@ -297,6 +390,6 @@ async def test_killed_edge_never_uses_a_block_number_twice(tmp_path: Path) -> No
         reported = await asyncio.to_thread(kill_while_writing, path)
         assert reported >= next_number + 20
         async with open_store(path) as store:
-            next_number = store._on_disk.state.next_number
+            next_number = store.position(PACK).next_number
             assert next_number >= reported
             assert numbers(await take(store, store.unconfirmed)) == list(range(1, next_number))

@@ -1,10 +1,22 @@
 """Edited batches of telemetry are rejected with a reason, or become blocks that can be decoded."""
 
+import contextlib
+import math
+import sqlite3
+
+from bms_estimator.edge.batching import Batcher
 from bms_estimator.edge.block import decode
-from bms_estimator.fleet.ingest.batch_columns import BatchError
-from bms_estimator.fleet.ingest.batch_samples import BatchReader
+from bms_estimator.edge.block_table import (
+    INGEST_TABLES,
+    BlockRange,
+    PackPosition,
+    Progress,
+    read_pages,
+    write_changes,
+)
+from bms_estimator.fleet.ingest.batch_samples import BatchError, BatchReader, select_new
 from bms_estimator.fleet.ingest.ingest import decode_batch
-from bms_estimator.fleet.ingest.open_blocks import NO_POSITION, OpenBlocks
+from bms_estimator.store.migrations import migrate
 from tests.fuzz.edited_seeds import edited_seeds
 
 ARRIVAL_S = 1_800_000_000.0
@@ -21,8 +33,13 @@ def test_edited_batches_are_rejected_with_a_reason_or_become_blocks(data: bytes)
     except BatchError as error:
         assert str(error)  # noqa: PT017
         return
-    blocks = OpenBlocks(60.0)
-    blocks.set_position("p", NO_POSITION)
-    selection = blocks.add("p", batch, ARRIVAL_S, 0.0, 1)
-    blocks.complete()
-    assert sum(decode(block.data).samples.size for block in blocks.completed) == selection.samples.size
+    selection, batcher = select_new(batch, -math.inf, ARRIVAL_S), Batcher(60.0)
+    ready = batcher.add(selection.samples, ARRIVAL_S, selection.cells_v) + batcher.cut()
+    with contextlib.closing(sqlite3.connect(":memory:", isolation_level=None)) as database:
+        migrate(database, INGEST_TABLES)
+        waiting = [("p", block) for block in ready]
+        limits = {"max_blocks": len(ready), "max_bytes": math.inf}
+        position = write_changes(database, {"p": PackPosition()}, waiting, (), Progress(), **limits)["p"]
+        blocks_of_pack = BlockRange("p", position.created_s, 1, position.next_number)
+        (page,) = read_pages(database, [blocks_of_pack], len(ready) + 1)
+    assert sum(decode(data).samples.size for data in page.blocks.values()) == selection.samples.size

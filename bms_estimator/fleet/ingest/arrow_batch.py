@@ -11,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values, check_count
+from bms_estimator.fleet.ingest.batch_samples import BatchColumns, BatchError, Values, check_count
 
 _HEADER, _LENGTH, _NODES, _COMPRESSION = 2, 0, 1, 3
 """Indices of fields: ``header`` of the table ``Message``; ``length``, ``nodes``, ``compression`` of the table ``RecordBatch``."""

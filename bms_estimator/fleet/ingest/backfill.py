@@ -7,15 +7,13 @@ from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 import duckdb
 import pyarrow as pa
 import structlog
 
 from bms_estimator.fleet.ingest.arrow_batch import columns_of
-from bms_estimator.fleet.ingest.batch_columns import BatchError
-from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples
+from bms_estimator.fleet.ingest.batch_samples import BatchError, BatchReader, BatchSamples
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.ingest.startup import Options, open_ingest
 from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, error_text
@@ -27,18 +25,11 @@ from bms_estimator.sources.captures.tables.layout import Column
 PACK_COLUMN = "pack"
 """Column with the name of the pack. A file without this column has the samples of one pack, and is named after it."""
 BATCH_ROWS = 4096
-"""Maximum number of rows in memory. This number of rows with 255 cells each has fewer values than ``batch_columns.MAX_VALUES``."""
+"""Maximum number of rows in memory. This number of rows with 255 cells each has fewer values than ``batch_samples.MAX_VALUES``."""
 MEMORY = "1GB"
 """Memory for sorting; larger data are sorted on disk."""
 DAY_S = 86_400.0
 """Duration of a day [s]."""
-
-
-class PackBatch(NamedTuple):
-    """Samples of one pack, in order of time."""
-
-    pack: str
-    batch: BatchSamples
 
 
 def parquet_files(paths: Sequence[Path]) -> list[Path]:
@@ -58,7 +49,9 @@ def parquet_files(paths: Sequence[Path]) -> list[Path]:
     return files
 
 
-def read_history(files: Sequence[Path], reader: BatchReader, folder: Path) -> Generator[PackBatch, None, None]:
+def read_history(
+    files: Sequence[Path], reader: BatchReader, folder: Path
+) -> Generator[tuple[str, BatchSamples], None, None]:
     """Yield the samples of all packs day by day, and within a day pack by pack, so that several workers are busy.
 
     Args:
@@ -96,14 +89,14 @@ def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
-def _split(rows: pa.RecordBatch, reader: BatchReader) -> Iterator[PackBatch]:
+def _split(rows: pa.RecordBatch, reader: BatchReader) -> Iterator[tuple[str, BatchSamples]]:
     """Yield the samples of each pack in some rows."""
     packs = rows.column(PACK_COLUMN).to_pylist()
     for pack, group in itertools.groupby(range(len(packs)), packs.__getitem__):
         numbers = list(group)
         columns = columns_of(rows.slice(numbers[0], len(numbers)).drop_columns([PACK_COLUMN, "day"]))
         try:
-            yield PackBatch(pack or "", reader.read(columns))
+            yield pack or "", reader.read(columns)
         except BatchError as error:
             raise UserError(f"--parquet: pack {pack}: {error}") from None
 
@@ -129,7 +122,7 @@ MAX_PART_SAMPLES = 4096
 """Maximum number of samples that are added at a time. They make at most as many blocks."""
 MAX_UNCONFIRMED_OF_PACK = 5000
 """Number of unconfirmed blocks of a pack at which the backfill waits. ``MAX_PART_SAMPLES`` more blocks may follow. The sum is
-below ``store_table.MAX_PACK_BLOCKS``, so that no block is dropped."""
+below ``ingest_store.MAX_PACK_BLOCKS``, so that no block is dropped."""
 MAX_UNCONFIRMED = 1_000_000
 """Number of unconfirmed blocks of all packs at which the backfill waits: 0.6 GB of minute blocks at 1 Hz."""
 SAVE_SAMPLES = 10_000
@@ -192,7 +185,7 @@ class Backfill:
             f"{counters['unknown']:,} of packs that are not in the table of packs{f' ({unknown})' if unknown else ''}"
         )
 
-    async def send(self, history: Iterator[PackBatch]) -> None:
+    async def send(self, history: Iterator[tuple[str, BatchSamples]]) -> None:
         """Send the samples of all packs."""
         while (entry := await asyncio.to_thread(next, history, None)) is not None and not self._stop.is_set():
             pack, batch = entry
@@ -200,7 +193,7 @@ class Backfill:
                 self._unknown.add(pack)
                 self._counters["unknown"] += batch.samples.size
                 continue
-            if pack not in self._store:
+            if pack not in self._store.blocks:
                 await self._add_pack(pack)
             for first in range(0, batch.samples.size, MAX_PART_SAMPLES):
                 await self._wait_for_confirmations(pack)
@@ -213,7 +206,7 @@ class Backfill:
         if self._stop.is_set():
             await self._store.send_remaining()
         else:
-            await until_first_ends(self._store.publisher.idle.wait(), self._stop.wait())
+            await until_first_ends(self._store.wait_until_sent(), self._stop.wait())
 
     async def _add_pack(self, pack: str) -> None:
         while not self._stop.is_set():
@@ -226,9 +219,8 @@ class Backfill:
                 return
 
     async def _add(self, pack: str, batch: BatchSamples) -> None:
-        sequence = (
-            self._store.progress.sequence + 1
-        )  # a value with which ``save`` leaves the progress in ``TELEMETRY`` unchanged
+        # a value with which ``save`` leaves the progress in ``TELEMETRY`` unchanged
+        sequence = self._store.blocks.progress.sequence + 1
         selection = self._store.add(pack, batch, time.time(), sequence)
         self._counters["samples"] += selection.samples.size
         self._counters["old"] += selection.old
@@ -239,21 +231,21 @@ class Backfill:
 
     async def _save(self) -> None:
         self._unsaved = 0
-        await self._store.save(self._store.progress.stream, self._store.progress.sequence)
+        await self._store.save(*self._store.blocks.progress)
         if time.monotonic() >= self._progress_s:
             self._progress_s = time.monotonic() + PROGRESS_S
-            log.info("backfill", **self._counters, unconfirmed=self._store.unconfirmed)
+            log.info("backfill", **self._counters, unconfirmed=self._store.blocks.unconfirmed)
 
     async def _wait_for_confirmations(self, pack: str) -> None:
         """Wait until workers have confirmed enough blocks for further samples."""
         request_s = time.monotonic() + REQUEST_S
-        while not self._stop.is_set() and not self._may_add(pack):
+        blocks = self._store.blocks
+        while not self._stop.is_set() and (
+            blocks.unconfirmed_of(pack) >= MAX_UNCONFIRMED_OF_PACK or blocks.unconfirmed >= MAX_UNCONFIRMED
+        ):
             await self._save()
             if time.monotonic() >= request_s:
                 request_s = time.monotonic() + REQUEST_S
-                for each in self._store.packs:
-                    await self._store.request_confirmation(each)
+                for each in blocks.packs:
+                    self._store.request_confirmation(each)
             await asyncio.sleep(WAIT_S)
-
-    def _may_add(self, pack: str) -> bool:
-        return self._store.unconfirmed_of(pack) < MAX_UNCONFIRMED_OF_PACK and self._store.unconfirmed < MAX_UNCONFIRMED

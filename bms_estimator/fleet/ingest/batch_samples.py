@@ -1,16 +1,15 @@
 """Samples of a telemetry batch: units, sign of the current, timestamps and order. No I/O."""
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from types import NoneType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.edge.cell_voltages import MAX_CELLS
-from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, Values, check_count
 from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S
 from bms_estimator.model.arrays import (
     MAX_CELL_V,
@@ -38,6 +37,13 @@ from bms_estimator.sources.captures.tables.layout import (
 )
 from bms_estimator.sources.captures.tables.layout_finder import LayoutFinder
 
+Values = Sequence[Any] | NDArray[Any]
+"""Values of a column: numbers, texts, ``datetime64`` timestamps, or one list of cell voltages for each row."""
+BatchColumns = Mapping[str, Values]
+"""Columns of equal length by name."""
+
+MAX_VALUES = 1 << 20
+"""Maximum number of values in a batch. An uncompressed message of 1 MiB cannot hold more numbers of one byte each."""
 MIN_TIME_S = 946_684_800.0
 """Earliest plausible timestamp: 2000-01-01 [s since 1970]."""
 MAX_LAYOUTS = 256
@@ -52,6 +58,20 @@ CELLS = "cells"
 _TABLE_NAME = "the batch"
 """Name of a batch in the errors of ``LayoutFinder``; removed from them."""
 _NUMBERS = {int, float, NoneType}
+
+
+class BatchError(ValueError):
+    """Error in a batch, with the reason."""
+
+
+def check_count(values: int) -> None:
+    """Check the number of values of a batch, before memory for them is allocated.
+
+    Raises:
+        BatchError: The number exceeds ``MAX_VALUES``.
+    """
+    if values > MAX_VALUES:
+        raise BatchError(f"{values:,} values: must be at most {MAX_VALUES:,}; send smaller batches")
 
 
 class BatchSamples(NamedTuple):

@@ -11,9 +11,15 @@ from typing import Any
 import structlog
 from nats.aio.client import Client
 
-from bms_estimator.fleet.ingest.batch_columns import BatchColumns, BatchError, check_count
 from bms_estimator.fleet.ingest.batch_reports import BatchReport, BatchReports
-from bms_estimator.fleet.ingest.batch_samples import BatchReader, drop_reason, split_by_time
+from bms_estimator.fleet.ingest.batch_samples import (
+    BatchColumns,
+    BatchError,
+    BatchReader,
+    check_count,
+    drop_reason,
+    split_by_time,
+)
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
 from bms_estimator.fleet.ingest.startup import NAME, Options, open_ingest
 from bms_estimator.fleet.ingest.telemetry_reader import DamagedStreamError, MissingStreamError, TelemetryReader
@@ -142,7 +148,7 @@ class Ingest:
     ) -> None:
         self._nc, self._store, self._bucket, self._reader, self._notifier = nc, store, bucket, reader, notifier
         self._buffer_bytes = buffer_bytes
-        self._telemetry = TelemetryReader(nc, store.progress.stream, store.progress.sequence)
+        self._telemetry = TelemetryReader(nc, *store.blocks.progress)
         self._reports = BatchReports(nc)
         self._counters = self._reports.counters
         self._trouble = ""
@@ -162,8 +168,7 @@ class Ingest:
             if pause_s:
                 await until_first_ends(asyncio.sleep(pause_s), stop.wait())
         self._notifier.stopping(NAME)
-        self._store.complete()
-        await self._save()
+        await self._save_open_blocks()
         await self._store.send_remaining()
         self._log_status()
 
@@ -195,7 +200,7 @@ class Ingest:
         """Apply changes of the table, save overdue blocks, check the stream, and report readiness to systemd."""
         await self._bucket.refresh()
         # a new server has an empty table, which must not remove the packs
-        for pack in self._store.packs if len(self._bucket.packs) else ():
+        for pack in self._store.blocks.packs if len(self._bucket.packs) else ():
             if pack not in self._bucket.packs:
                 log.info("a pack was removed from the table; its stored blocks are removed", pack=pack)
                 self._store.remove(pack)
@@ -209,7 +214,7 @@ class Ingest:
     async def _check_stream(self) -> None:
         """Check the stream, and create it again if it is missing or damaged."""
         try:
-            lost = await self._telemetry.check(self._store.progress.sequence)
+            lost = await self._telemetry.check(self._store.blocks.progress.sequence)
             if lost is not None:
                 await self._on_lost(lost)
         except MissingStreamError:  # the server was replaced
@@ -232,7 +237,7 @@ class Ingest:
             log.error("the server has lost batches", batches=len(lost), first=lost[0], last=lost[-1])
 
     async def _save_open_blocks(self) -> None:
-        """Complete and save the open blocks, because their batches cannot be read again."""
+        """Complete and save the open blocks, whose batches are not read again."""
         self._store.complete()
         await self._save()
 
@@ -245,7 +250,7 @@ class Ingest:
         if any(pack not in self._bucket.packs for pack in packs):
             await self._bucket.refresh()  # the pack may be new
         for pack in packs:
-            if pack in self._bucket.packs and pack not in self._store:
+            if pack in self._bucket.packs and pack not in self._store.blocks:
                 await self._store.add_pack(pack)
         for i, message in enumerate(messages):
             await self._process_one(message)
@@ -255,7 +260,7 @@ class Ingest:
     async def _process_one(self, message: StoredMessage) -> None:
         pack = message.subject.partition(".")[2]
         self._counters["batches"] += 1
-        if pack not in self._store:
+        if pack not in self._store.blocks:
             await self._reports.reject_unknown(message, pack)
             return
         last_s, counts = self._store.last_s(pack), Counter[str]()
@@ -290,14 +295,14 @@ class Ingest:
 
     def _log_status(self) -> None:
         self._reports.log_unknown()
-        publisher = self._store.publisher
+        blocks = self._store.blocks
         log.info(
             "ingested",
             **self._counters,
-            blocks_sent=publisher.published,
-            resends=publisher.resends,
-            unconfirmed=self._store.unconfirmed,
-            dropped_blocks=self._store.dropped,
+            blocks_sent=self._store.published,
+            resends=blocks.resends,
+            unconfirmed=blocks.unconfirmed,
+            dropped_blocks=blocks.dropped,
         )
 
 

@@ -4,7 +4,6 @@ One connection serves many edges. With a socket for each edge the operating syst
 """
 
 import asyncio
-import contextlib
 import itertools
 import time
 import uuid
@@ -20,6 +19,7 @@ from bms_estimator.edge.subjects import BlockRequest, block_request, raw
 from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.mqtt.connection import brokers, tls_context
+from bms_estimator.process.runtime import until_first_ends
 from bms_estimator.settings.outputs import MqttSettings
 
 POLL_S = 0.1
@@ -148,7 +148,8 @@ async def run_edges(
     topics = [raw(name).replace(".", "/") for name in fleet.names]
     sent_bytes, last_progress_s, last_busy_s = 0, time.monotonic(), time.monotonic()
     try:
-        while not await _wait_for_stop(stop) and time.monotonic() - last_busy_s < quiet_s:
+        while not stop.is_set() and time.monotonic() - last_busy_s < quiet_s:
+            await until_first_ends(asyncio.sleep(POLL_S), stop.wait())
             _process_replies(replies, edges)
             sent_bytes += _send(fleet, edges, open_connections, topics)
             if not edges.done or any(connection.in_flight for connection in open_connections):
@@ -160,13 +161,6 @@ async def run_edges(
     finally:
         for connection in open_connections:
             await asyncio.to_thread(connection.end)
-
-
-async def _wait_for_stop(stop: asyncio.Event) -> bool:
-    """Wait up to ``POLL_S`` for ``stop``; return True if it is set."""
-    with contextlib.suppress(TimeoutError):
-        await asyncio.wait_for(stop.wait(), POLL_S)
-    return stop.is_set()
 
 
 def _process_replies(replies: deque[tuple[str, bytes]], edges: SimulatedEdges) -> None:

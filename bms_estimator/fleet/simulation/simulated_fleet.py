@@ -10,7 +10,6 @@ from the values in the table of packs, because real packs age and vary.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -71,20 +70,11 @@ OUTLIER_FRACTION = 0.01
 """Fraction of packs that are worn out. An equal fraction is failing."""
 
 
-class _Draw(IntEnum):
-    """Random values of a pack. Each has its own stream of numbers."""
-
-    STORE_DELAY = 1
-    PERIOD = 2
-    PHASE = 3
-    TEMPERATURE = 4
-    DEFECT = 5
-    CAPACITY = 6
-    RESISTANCE = 7
-    JITTER = 8
-    CURRENT_NOISE = 9
-    VOLTAGE_NOISE = 10
-    PULSE = 11
+_Draw = IntEnum(
+    "_Draw",
+    "STORE_DELAY PERIOD PHASE TEMPERATURE DEFECT CAPACITY RESISTANCE JITTER CURRENT_NOISE VOLTAGE_NOISE PULSE",
+)
+"""Random values of a pack. Each has its own stream of numbers."""
 
 
 class Kind(NamedTuple):
@@ -134,16 +124,6 @@ class _Curves:
         )
 
 
-@dataclass(frozen=True)
-class Truth:
-    """Ground truth of each pack, hidden from the estimators. Arrays of shape (packs,)."""
-
-    capacity_as: Floats
-    """True capacity [A s]."""
-    resistance: Floats
-    """True resistances divided by those of the cell file."""
-
-
 class SimulatedFleet:
     """Fleet of simulated packs.
 
@@ -155,7 +135,8 @@ class SimulatedFleet:
     Attributes:
         names: Names of the packs.
         store_created_ns: Creation time of each edge's store [ns since 1970], shape (packs,).
-        truth: Ground truth of the packs.
+        true_capacity_as: True capacity of each pack [A s], hidden from the estimators, shape (packs,).
+        true_resistance: True resistances of each pack divided by those of the cell file, shape (packs,).
     """
 
     def __init__(self, packs: int, *, seed: int, begin_ns: int) -> None:
@@ -170,16 +151,16 @@ class SimulatedFleet:
         self._omega = 2.0 * math.pi / (MIN_PERIOD_S + (MAX_PERIOD_S - MIN_PERIOD_S) * self._uniform(pack, _Draw.PERIOD))
         self._phase = 2.0 * math.pi * self._uniform(pack, _Draw.PHASE)
         self._temperature_c = np.round(20.0 + 10.0 * self._uniform(pack, _Draw.TEMPERATURE), 1)
-        self.truth = self._draw_truth(pack)
+        self.true_capacity_as, self.true_resistance = self._draw_truth(pack)
 
-    def _draw_truth(self, pack: Ints) -> Truth:
+    def _draw_truth(self, pack: Ints) -> tuple[Floats, Floats]:
         defect = self._uniform(pack, _Draw.DEFECT)
         capacity = MIN_CAPACITY + (MAX_CAPACITY - MIN_CAPACITY) * self._uniform(pack, _Draw.CAPACITY)
         resistance = MIN_RESISTANCE + (MAX_RESISTANCE - MIN_RESISTANCE) * self._uniform(pack, _Draw.RESISTANCE)
         capacity[defect < OUTLIER_FRACTION] = WORN_OUT_CAPACITY
         resistance[(defect >= OUTLIER_FRACTION) & (defect < 2 * OUTLIER_FRACTION)] = FAILING_RESISTANCE
         rated_as = np.array([curves.capacity_as for curves in self._curves])
-        return Truth(capacity * rated_as[self._kind_index], resistance)
+        return capacity * rated_as[self._kind_index], resistance
 
     def kind(self, pack: int) -> Kind:
         """Return the kind of a pack as in the table of packs."""
@@ -237,7 +218,7 @@ class SimulatedFleet:
         minute = np.floor(time_s / BLOCK_S)
         pulse_a = self._pulse_a(packs, minute.astype(np.int64))
         pulse_as = pulse_a * _pulse_charge_s(time_s - minute * BLOCK_S)
-        return self._slow_soc(packs, time_s) - pulse_as / self.truth.capacity_as[packs]
+        return self._slow_soc(packs, time_s) - pulse_as / self.true_capacity_as[packs]
 
     def _slow_soc(self, packs: Ints, time_s: Floats) -> Floats:
         angle = self._omega[packs] * time_s + self._phase[packs]
@@ -253,12 +234,12 @@ class SimulatedFleet:
             * omega
             * (SLOW_FRACTION * np.cos(angle) + FREQUENCY_RATIO * FAST_FRACTION * np.cos(FREQUENCY_RATIO * angle))
         )
-        return -slope * self.truth.capacity_as[packs]
+        return -slope * self.true_capacity_as[packs]
 
     def _pulse_a(self, packs: Ints, minutes: Ints) -> Floats:
         """Return the current of the pulse in each minute [A]."""
         return (
-            PULSE_C / 3600.0 * self.truth.capacity_as[packs] * (2.0 * self._uniform(packs, _Draw.PULSE, minutes) - 1.0)
+            PULSE_C / 3600.0 * self.true_capacity_as[packs] * (2.0 * self._uniform(packs, _Draw.PULSE, minutes) - 1.0)
         )
 
     def _current_and_voltage(self, packs: Ints, numbers: Ints, curves: _Curves) -> tuple[Floats, Floats]:
@@ -278,7 +259,7 @@ class SimulatedFleet:
             np.interp(soc, curves.soc, values) for values in (curves.ocv_v, curves.r_s, curves.r_ts, curves.r_tl)
         )
         drop_v = r_s * current_a + r_ts * branch_a + r_tl * delayed_a  # (2.4) of the thesis
-        return current_a, ocv_v - self.truth.resistance[column] * drop_v
+        return current_a, ocv_v - self.true_resistance[column] * drop_v
 
     def _uniform(self, packs: Ints, draw: _Draw, index: Ints | int = 0) -> Floats:
         """Return uniform numbers in [0, 1) that depend only on seed, pack, ``draw`` and ``index``."""

@@ -9,8 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from bms_estimator.fleet.ingest.batch_columns import BatchError
-from bms_estimator.fleet.ingest.batch_samples import BatchReader
+from bms_estimator.fleet.ingest.batch_samples import BatchError, BatchReader
 from bms_estimator.fleet.ingest.ingest import decode_batch
 from bms_estimator.telemetry.alarms.definitions import Change
 from tests.benchmarks.table import Row

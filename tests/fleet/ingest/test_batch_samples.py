@@ -12,8 +12,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from bms_estimator.fleet.ingest.batch_columns import BatchError
-from bms_estimator.fleet.ingest.batch_samples import BatchReader, BatchSamples, drop_reason, select_new, split_by_time
+from bms_estimator.fleet.ingest.batch_samples import (
+    BatchError,
+    BatchReader,
+    BatchSamples,
+    drop_reason,
+    select_new,
+    split_by_time,
+)
 from bms_estimator.fleet.ingest.ingest import decode_batch
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map

@@ -17,10 +17,10 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
-from bms_estimator.fleet.ingest import batch_samples, telemetry_reader
 from bms_estimator.fleet.ingest import ingest as ingest_module
+from bms_estimator.fleet.ingest import telemetry_reader
 from bms_estimator.fleet.ingest.batch_reports import BatchReport
-from bms_estimator.fleet.ingest.batch_samples import Selection
+from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection
 from bms_estimator.fleet.ingest.ingest_store import FILE, IngestStore
 from bms_estimator.fleet.ingest.telemetry_reader import TelemetryReader
 from bms_estimator.fleet.nats.dead_letters import read_dead_letters, replay_letter
@@ -225,12 +225,18 @@ async def test_rejected_batch_is_reported_and_can_be_replayed(nc: Client, cluste
 async def test_no_batch_stops_the_batches_after_it(
     nc: Client, cluster: NatsCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(batch_samples, "MAX_CELLS", 1000)  # the batch passes the check, but cannot be encoded
+    add = IngestStore.add
+
+    def add_all_but_seven_cells(store: IngestStore, pack: str, batch: BatchSamples, *more: Any) -> Selection:
+        if batch.cells_v.shape[1] == 7:
+            raise KeyError(7)
+        return add(store, pack, batch, *more)
+
+    monkeypatch.setattr(IngestStore, "add", add_all_but_seven_cells)
     await load_packs(nc, ["p1", "p2"])
     rows = samples_of("p1", 12)
-    many_cells = json_batch(rows, **{f"cell_{number}_v": [3.7] * 12 for number in range(1, 301)})
     rejected = {
-        many_cells: "internal error: error in block.py",
+        json_batch(rows, cells_v=[[3.7] * 7] * 12): "internal error: KeyError in test_ingest.py, line",
         json_batch(rows, cells_v=[[[3.7]]] * 12): "cells_v: must be numbers",
         b'{"time_s": [1], "current_a": [1], "\\ud800": [1]}': r"no column of voltage; found time_s, current_a, \ud800",
         b"[" * MAX_BATCH_BYTES: "neither JSON nor Arrow IPC: maximum recursion depth exceeded",

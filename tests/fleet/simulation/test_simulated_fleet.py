@@ -53,7 +53,7 @@ def test_charge_of_the_samples_agrees_with_the_change_of_the_true_soc() -> None:
         simulated.samples(packs, np.full(packs.size, n))["current_a"].sum(axis=1) for n in range(begin, end)
     )
     socs = [simulated.soc(packs, np.full(packs.size, (n - 1.0) * BLOCK_S)) for n in (begin, end)]
-    assert charge_as / simulated.truth.capacity_as == pytest.approx(socs[0] - socs[1], abs=2e-4)
+    assert charge_as / simulated.true_capacity_as == pytest.approx(socs[0] - socs[1], abs=2e-4)
 
 
 def test_estimator_with_the_settings_of_each_kind_of_pack_converges_to_the_true_soc() -> None:
