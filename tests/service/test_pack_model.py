@@ -38,6 +38,8 @@ from tests.pack_model.quick_fit import LN_CAPACITY, quick_fit
 from tests.patience import LONG_S
 from tests.scripted_source import Collector, ScriptedSource
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 FORMAT_7_FILE = Path(__file__).parent.parent / "checkpoint" / "checkpoint_format_7.npz"
 """Checkpoint of a ``chen_mora`` cell by a version without history; SOC 0.3710."""
 FORMAT_7_SETTINGS = {"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}}
