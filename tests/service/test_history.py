@@ -35,6 +35,9 @@ from tests.patience import LONG_S
 from tests.scripted_source import Collector, ScriptedSource
 
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
+
 def clock_at(hours: float) -> BootTimestamp:
     """Return the clocks of one boot of the machine at a time [h]. At 0 h it is 2023-11-14T22:13:20Z."""
     return BootTimestamp(1.7e9 + 3600.0 * hours, synchronised=True, boot_s=5000.0 + 3600.0 * hours, boot="one")
