@@ -10,6 +10,8 @@ import pytest
 import structlog
 from hypothesis import HealthCheck, settings
 
+from bms_estimator.forecast import projection
+from bms_estimator.reports import svg_plot
 from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.full_disk import disk_without_files, full_disk
 from tests.mosquitto import broker
@@ -126,3 +128,16 @@ def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "state-home"
     monkeypatch.setenv("XDG_STATE_HOME", str(folder))
     return folder
+
+
+@pytest.fixture
+def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make forecasts from fewer draws, for tests of other values of a pack that runs for hours."""
+    monkeypatch.setattr(projection, "DRAWS", 40)
+    monkeypatch.setattr(projection, "CURVE_DRAWS", 40)
+
+
+@pytest.fixture
+def empty_plots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave plots empty, for tests of the texts and tables of reports."""
+    monkeypatch.setattr(svg_plot, "_svg", lambda *_: "<svg></svg>")

@@ -18,6 +18,8 @@ from bms_estimator.settings.pack import Settings
 from tests.pack_model.quick_fit import LN_CAPACITY, quick_fit
 from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 SETTINGS = Settings.model_validate({"pack": {"cell": "nmc", "series": CELLS}})
 
 

@@ -38,12 +38,13 @@ def replay(folder: Path, python: tuple[str | Path, ...], *options: str, **variab
 def assert_equal(folder: Path, *python: str | Path, **variables: str) -> None:
     """Expect the estimates of this machine to the last bit from another Python, and up to rounding with a fit."""
     here, there = (sys.executable,), python or (sys.executable,)
-    assert replay(folder, there, "--no-pack-model", **variables) == replay(folder, here, "--no-pack-model")
-    tables = [replay(folder, here), replay(folder, there, **variables)]
+    without_fit, *tables = (replay(folder, here, *options) for options in (["--no-pack-model"], []))
+    assert replay(folder, there, "--no-pack-model", **variables) == without_fit
+    tables.append(replay(folder, there, **variables))
     fitted, other = (np.genfromtxt(table.splitlines(), delimiter=",", names=True) for table in tables)
     for name in fitted.dtype.names:
         np.testing.assert_allclose(other[name], fitted[name], rtol=ROUNDING, err_msg=name)
-    assert tables[0] != replay(folder, here, "--no-pack-model")  # the fit was adopted
+    assert tables[0] != without_fit  # the fit was adopted
 
 
 def test_a_cpu_without_newer_instructions_has_the_same_estimates(tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import IdentifiedValue, current_offset, relative_capacity
 from bms_estimator.kernels.kalman_filter.records import LN_Q
 from bms_estimator.pack.pack import Pack
@@ -20,8 +20,8 @@ from tests.estimator.anywhere.use import DAY_S, cycles, days
 from tests.fit_interval import fits_every
 
 SEEDS = range(1, 9)
-FEW_SEEDS = SEEDS[:4]
-"""Seeds of the runs with the slow fit, which take most of the time. Tests with the mark ``thorough`` use all of ``SEEDS``."""
+FEW_SEEDS = SEEDS[:2]
+"""Seeds of the shorter tests. Tests with the mark ``thorough`` use all of ``SEEDS``."""
 OWN_CURVE = {"file_ocv_error_ratio": 0.5, "load_before_h": 0.0}
 """Half of the typical OCV error, and no load before the estimator starts."""
 FIT_INTERVAL_S = 3.0 * 3600.0
@@ -98,10 +98,17 @@ def test_a_gain_error_of_the_current_sensor_is_learned_as_a_capacity() -> None:
     assert np.sqrt(np.mean(np.square(errors))) < MAX_RMS_CAPACITY_ERROR
 
 
-@pytest.mark.parametrize("temperature_c", [25.0, pytest.param(0.0, marks=pytest.mark.thorough)])
-def test_an_offset_of_20_ma_is_identified_within_a_day(temperature_c: float) -> None:
+@pytest.mark.parametrize(
+    ("temperature_c", "seeds"),
+    [
+        (25.0, FEW_SEEDS),
+        pytest.param(25.0, SEEDS, marks=pytest.mark.thorough),
+        pytest.param(0.0, SEEDS, marks=pytest.mark.thorough),
+    ],
+)
+def test_an_offset_of_20_ma_is_identified_within_a_day(temperature_c: float, seeds: Sequence[int]) -> None:
     errors_over_std = []
-    for seed in SEEDS:
+    for seed in seeds:
         offset_a = 0.02 if seed % 2 else -0.02
         parameters = {"file_capacity_ratio": 1.1, "offset_a": offset_a, "temperature_c": temperature_c}
         recording = simulate_use(Case("offset", soc=0.8, seed=seed, **parameters, **OWN_CURVE), count=1)

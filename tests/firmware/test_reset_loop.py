@@ -22,7 +22,7 @@ from tests.simavr_board import SimavrBoard, write_readings
 pytestmark = pytest.mark.usefixtures("firmware")
 
 LOAD_A = 5.0
-RESETS = 30
+RESETS = 10
 """Number of resets of the board while the alarm is latched."""
 SAMPLES = 30
 """Number of samples between two resets, in which a service that does not wait would switch the relay."""

@@ -251,6 +251,7 @@ def count_changes(home: HomeAssistant, device: str) -> int:
     return sum(count - 1 for count in rows_by_entity.values())
 
 
+@pytest.mark.thorough
 def test_button_sets_the_current_zero_once_the_pack_has_rested(
     home: HomeAssistant, packs: Packs, broker: Broker
 ) -> None:
@@ -265,6 +266,7 @@ def test_button_sets_the_current_zero_once_the_pack_has_rested(
         time.sleep(1.0)
 
 
+@pytest.mark.thorough
 def test_entities_are_unavailable_from_the_kill_of_the_service_until_its_restart(
     home: HomeAssistant, packs: Packs
 ) -> None:

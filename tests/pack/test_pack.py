@@ -18,6 +18,8 @@ from bms_estimator.simulation.simulated_pack import constant
 from tests.pack_model.quick_fit import quick_fit
 from tests.simulated_pack import CAPACITY_AH, SimulatedPack
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 HOURS, STEP_S = 4, 10.0
 
 

@@ -58,7 +58,7 @@ class Tab:
 
     async def until(self, condition: str, argument: Any = None) -> None:
         """Wait until a JavaScript expression is true."""
-        await self.page.wait_for_function(condition, arg=argument)
+        await self.page.wait_for_function(condition, arg=argument, polling=100)
 
     async def until_status(self, text: str) -> None:
         """Wait until the status line contains this text."""

@@ -9,6 +9,8 @@ from bms_estimator.reports.history_report import PackHistory, history_report
 from bms_estimator.reports.report_parts import AgingHistory, duration_text
 from bms_estimator.store.history import Minute
 
+text_only = pytest.mark.usefixtures("empty_plots")
+
 
 def history_of(time_s, **columns):
     """Return a history of minutes without events, whose columns are 60 unless given."""
@@ -23,6 +25,7 @@ def groups_of(history):
     return {group.title: group for group in history_report(history, "2026-01-01").sections[0].groups}
 
 
+@text_only
 def test_minutes_that_passed_twice_are_counted():
     rows = dict(groups_of(history_of([0.0, 60.0, 61.0, 120.0]))["Data quality"].rows)
     assert rows["clock"] == "set back; minutes that passed twice: 1"
@@ -52,6 +55,7 @@ def test_one_minute_has_a_sentence_instead_of_figures():
     assert "0.0123 Ah were drawn and 60 Ah charged." in page.sentences
 
 
+@text_only
 def test_figure_without_values_is_replaced_by_a_sentence():
     history = history_of(60.0 * np.arange(100), soc=np.nan, soc_std=np.nan, temperature_c=np.nan)
     over_time = groups_of(history)["Over time"]
@@ -60,6 +64,7 @@ def test_figure_without_values_is_replaced_by_a_sentence():
     assert "Temperature: no figure, because it was not measured" in over_time.remark
 
 
+@text_only
 def test_small_charges_and_currents_have_more_decimals():
     small = history_of(
         [0.0, 60.0], charge_out_ah=0.01, charge_in_ah=0.0, energy_out_wh=0.04, current_min_a=0.1, current_max_a=0.25
@@ -70,11 +75,13 @@ def test_small_charges_and_currents_have_more_decimals():
     assert groups_of(large)["Days"].rows[0][7] == "4.0"
 
 
+@text_only
 def test_table_of_days_has_the_last_two_months():
     rows = groups_of(history_of(86_400.0 * np.arange(70)))["Days"].rows
     assert (len(rows), rows[0][0], rows[-1][0]) == (62, "1970-01-09", "1970-03-11")
 
 
+@text_only
 def test_missing_fit_is_a_sentence():
     group = groups_of(history_of([0.0, 60.0]))["Capacity and resistances over days"]
     assert (group.figures, group.rows, group.remark) == ((), (), "No fit.")

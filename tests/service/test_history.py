@@ -34,6 +34,8 @@ from tests.checkpoint.test_checkpoint import (
 from tests.patience import LONG_S
 from tests.scripted_source import Collector, ScriptedSource
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 
 def clock_at(hours: float) -> BootTimestamp:
     """Return the clocks of one boot of the machine at a time [h]. At 0 h it is 2023-11-14T22:13:20Z."""

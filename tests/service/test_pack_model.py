@@ -13,8 +13,7 @@ import pytest
 
 from bms_estimator.checkpoint.arrays_file import FORMAT, ArraysFile
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import compiled_estimator
+from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity, relative_series_resistance
 from bms_estimator.model.arrays import NO_CELLS, SampleBlock, fields
 from bms_estimator.model.cell import load_cell
@@ -36,6 +35,8 @@ from tests.estimator.simulated_cell import TRUTH, measured, wrong_cell
 from tests.pack_model.quick_fit import LN_CAPACITY, quick_fit
 from tests.patience import LONG_S
 from tests.scripted_source import Collector, ScriptedSource
+
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 FORMAT_7_FILE = Path(__file__).parent.parent / "checkpoint" / "checkpoint_format_7.npz"
 """Checkpoint of a ``chen_mora`` cell by a version without history; SOC 0.3710."""

@@ -108,9 +108,9 @@ def checkpoints(state_home: Path) -> list[Path]:
     return [path for path in (state_home / "bms-estimator").glob("*.npz") if ".load" not in path.suffixes]
 
 
-async def stop_service(process: Process) -> list[Any]:
-    """Stop the service by SIGTERM. Return the decoded lines of its log."""
-    process.send_signal(signal.SIGTERM)
+async def stop_service(process: Process, signal_number: signal.Signals = signal.SIGTERM) -> list[Any]:
+    """Stop the service by a signal. Return the decoded lines of its log."""
+    process.send_signal(signal_number)
     assert process.stderr
     log = await asyncio.wait_for(process.stderr.read(), LONG_S)
     assert await asyncio.wait_for(process.wait(), LONG_S) == 0, log
@@ -143,7 +143,7 @@ async def test_a_killed_service_goes_offline_by_its_last_will_and_a_stopped_one_
         before = len(live.messages)
         async with service(pack) as process:
             await live.wait("bms/pack/state", skip=before)
-            lines = await stop_service(process)
+            lines = await stop_service(process, signal.SIGINT)
         await live.wait("bms/pack/availability", lambda p: p == b"offline", skip=before)
     board.cancel()
     (checkpoint,) = checkpoints(state_home)  # no folder is configured
@@ -229,22 +229,12 @@ async def test_a_hanging_disk_and_an_unread_log_delay_neither_estimates_nor_shut
     board.cancel()
 
 
-@pytest.mark.parametrize(
-    "signal_number",
-    [
-        pytest.param(signal.SIGHUP, marks=pytest.mark.thorough),
-        pytest.param(signal.SIGTERM, marks=pytest.mark.thorough),  # ends the service of most tests in this file
-        signal.SIGINT,
-    ],
-    ids=lambda number: number.name,
-)
-async def test_hangup_termination_and_interrupt_end_the_service_cleanly(
-    tmp_path: Path, line: Line, broker: Broker, signal_number: signal.Signals
-) -> None:
+@pytest.mark.thorough
+async def test_a_hangup_ends_the_service_cleanly(tmp_path: Path, line: Line, broker: Broker) -> None:
     pack, program = pack_file(tmp_path, line, broker, "house"), [sys.executable, "-c", DEFAULT_HANGUP]
     async with Listener(broker) as live, service(pack, program=program) as process:
         await live.wait("bms/house/health")
-        process.send_signal(signal_number)
+        process.send_signal(signal.SIGHUP)
         await live.wait("bms/house/availability", lambda payload: payload == b"offline")
         assert await asyncio.wait_for(process.wait(), LONG_S) == 0
 

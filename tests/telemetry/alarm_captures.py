@@ -136,7 +136,9 @@ async def replayed(
     now_s, result, sink = 0.0, ReplayResult(), Collector()
     source = Replay(open_capture(path, settings_.sensor), max_block_s=math.inf if at_once else 0.05)
     identifier = settings_.identifier.model_copy(update={"pack_model": False})
-    pack = new_pack(settings_.model_copy(update={"identifier": identifier}), cell)
+    publish = settings_.publish.model_copy(update={"rate_hz": 0.1})  # changed alarms are published at once
+    settings_ = settings_.model_copy(update={"identifier": identifier, "publish": publish})
+    pack = new_pack(settings_, cell)
     clock = Clock(wall=lambda: begin_s + now_s, monotonic=lambda: now_s)
     publisher = Publisher(settings_, pack, source=source, sinks=[sink], clock=clock, on_alarm=result.changes.append)
     publisher.alarm_monitor.restore(saved_state)

@@ -43,6 +43,7 @@ def test_validate_reads_an_export_from_standard_input(
     )
 
 
+@pytest.mark.usefixtures("empty_plots")
 def test_report_reads_an_export_from_standard_input(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,6 +25,8 @@ from tests.command_line import run
 from tests.pack_model.histories import Truth, cell_curves, measured_rows, with_voltages
 from tests.store.test_history import record_history, snapshot_at
 
+pytestmark = pytest.mark.usefixtures("empty_plots")  # but for the fixture ``page``, which is older than a test
+
 PACK = '[pack]\nname = "shed"\ncell = "nmc"\ncapacity_ah = 30\nseries = 13\n'
 
 
@@ -245,7 +247,7 @@ def test_page_has_the_rated_capacity_of_the_cell(page):
 
 
 def test_temperature_without_sensor_reaches_validation_and_report(tmp_path, capsys):
-    rows = capture(steps())
+    rows = capture(steps(duration_s=4000))
     measured, unmeasured = rows.copy(), rows.copy()
     measured["temperature_c"], unmeasured["temperature_c"] = 0.0, np.nan
     paths = [write_table(tmp_path / "sensor.csv", measured), write_table(tmp_path / "no_sensor.csv", unmeasured)]

@@ -269,6 +269,7 @@ def test_an_interrupted_test_of_another_pack_is_not_continued(capsys, tmp_path) 
     assert (tmp_path / "cell.calibration.json").read_text() == state
 
 
+@pytest.mark.usefixtures("empty_plots")
 def test_series_and_temperature_reach_fit_validation_and_report(capsys, data, tmp_path) -> None:
     rows = [line.split(",") for line in _text_of(data / "lgm50" / "rate_0p1c_25c.csv.gz").splitlines()]
     voltage = rows[0].index("voltage_v")

@@ -57,6 +57,7 @@ async def adoptable_fit(nc: Client) -> bool:
     return bool(results) and results[-1].fit is not None and results[-1].min_filter_std == 0.0
 
 
+@pytest.mark.thorough
 async def test_worker_that_is_killed_between_a_fit_and_its_adoption_changes_no_bit(tmp_path, cluster, fitter) -> None:
     nc = await connected(cluster.urls)
     await make_streams(nc, partitions=1)

@@ -94,7 +94,7 @@ def record_of(stream: Stream) -> np.ndarray:
 
 
 def test_worker_that_is_killed_after_each_message_agrees_with_a_replay_bit_for_bit(samples) -> None:
-    stream, pack = FittedStream(), new_pack(SETTINGS, CELL)
+    stream, pack = FittedStream(), new_pack(SETTINGS, CELL, has_forecasts=False)
     stream.send_all(blocks_of(samples, size=BLOCK_SAMPLES), take_over=True)
     pack.run(samples)
     assert pack.slow_fit.fits >= 2
@@ -108,7 +108,7 @@ def test_worker_that_is_killed_after_each_message_agrees_with_a_replay_bit_for_b
 def test_late_fit_is_adopted_at_the_next_sample_and_a_takeover_in_between_changes_nothing(samples) -> None:
     streams = [FittedStream(), FittedStream()]
     for stream, take_over in zip(streams, (False, True), strict=True):
-        stream.send_all(blocks_of(samples, size=BLOCK_SAMPLES), take_over=take_over, late_blocks=10)
+        stream.send_all(blocks_of(samples, size=5 * BLOCK_SAMPLES), take_over=take_over, late_blocks=2)
         assert min(stream.partition.counters["fits"], stream.partition.counters["late_fits"]) >= 2
     assert record_of(streams[0]).tobytes() == record_of(streams[1]).tobytes()
     assert streams[0].partition.snapshot().packs == streams[1].partition.snapshot().packs

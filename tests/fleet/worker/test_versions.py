@@ -142,6 +142,7 @@ async def test_states_survive_a_rolling_upgrade_and_a_roll_back_while_blocks_arr
     assert all(each.counters[UPGRADED] and each.counters[DOWNGRADED] for each in partitions)
 
 
+@pytest.mark.thorough
 async def test_status_shows_the_builds_of_workers_by_their_commits(nc, heartbeats, workers, cluster, tmp_path) -> None:
     project, by_worker = link_project(tmp_path / "project"), {}
     for name in ("old", "new"):
