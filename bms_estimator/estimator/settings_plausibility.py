@@ -82,6 +82,41 @@ def implausible_measurement(cell: PackModel, voltage_v: float, current_a: float,
     )
 
 
+class Contradictions:
+    """Settings that the first values of a device contradict, until its values at rest agree with them.
+
+    Later values are not compared as long as the first agree, because a pack that was just charged or is empty has such a voltage.
+
+    Args:
+        cell: Model of the whole pack.
+
+    Attributes:
+        texts: One line for each setting, with the values of the first comparison.
+    """
+
+    def __init__(self, cell: PackModel) -> None:
+        self._cell, self._device_ah, self._is_compared = cell, math.nan, False
+        self.texts = list[str]()
+
+    def add(self, voltage_v: float, current_a: float, device_ah: float) -> bool:
+        """Compare the values of a sample. Return True for those of the first sample, and the first capacity of the device.
+
+        Args:
+            voltage_v: Voltage of the pack [V]; NaN: unknown.
+            current_a: Current [A]; NaN: unknown.
+            device_ah: Capacity that the device reports [Ah]; NaN: unknown.
+        """
+        has_first_capacity = math.isnan(self._device_ah) and not math.isnan(device_ah)
+        is_first = not math.isnan(voltage_v) and (not self._is_compared or has_first_capacity)
+        self._device_ah = self._device_ah if math.isnan(device_ah) else device_ah
+        if is_first or (self.texts and abs(current_a) <= MAX_RESTING_C * self._cell.one_c_a):
+            lines = implausible_measurement(self._cell, voltage_v, current_a, self._device_ah)
+            settings = {line.split()[0] for line in lines}
+            self.texts = lines if is_first else [text for text in self.texts if text.split()[0] in settings]
+            self._is_compared = True
+        return is_first
+
+
 def _contradictions(cell: CellModel, voltage_v: float, current_a: float, device_ah: float) -> Iterator[str]:
     capacity_ah, series = cell.cell.capacity_ah, cell.cell.series_count
     if abs(device_ah - capacity_ah) > CAPACITY_TOLERANCE * max(device_ah, capacity_ah):

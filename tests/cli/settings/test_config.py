@@ -24,6 +24,7 @@ def test_init_writes_defaults_that_check_accepts(pack, capsys):
     code, out, err = run(capsys, "config", "check", pack)
     assert (code, err) == (0, "")
     assert out.startswith(f"{pack}: valid; pack: ncr18650, 1 in series")
+    assert f"bms-estimator doctor {pack}" in out
     assert load_settings(pack) == Settings()
 
 
