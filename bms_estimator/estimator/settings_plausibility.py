@@ -205,7 +205,7 @@ def _full_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None:
     limits = settings.charge_limits
     ocv_v = ocv_grid(between_limits(cell, limits))[0]
     soc = soc_at_full(ocv_v, limits)
-    if soc >= MIN_FULL_SOC:
+    if soc >= MIN_FULL_SOC and (limits.full_voltage_v or 0.0) <= cell.cell.voltage_max_v:
         return None
     return (
         f"pack.full_voltage_v = {limits.full_voltage_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there and SOC 1 at "
@@ -218,7 +218,7 @@ def _cutoff_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None
     limits = settings.charge_limits
     ocv_v = ocv_grid(between_limits(cell, limits))[0]
     soc = soc_at_cutoff(ocv_v, limits)
-    if soc <= MAX_EMPTY_SOC:
+    if soc <= MAX_EMPTY_SOC and (limits.cutoff_voltage_v or math.inf) >= cell.cell.voltage_min_v:
         return None
     return (
         f"pack.cutoff_voltage_v = {limits.cutoff_voltage_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there and SOC 0 "
@@ -253,13 +253,17 @@ def _more_cells_than_series(settings: Settings, cell: CellModel) -> str | None:
 def _current_limits_without_effect(settings: Settings, cell: CellModel) -> Iterator[str]:
     """Yield a line for each current limit above the limit of an alarm or of the cell file, which then applies."""
     alarms: dict[str, float] = {alarm.name: alarm.limit for alarm in monitored_alarms(settings, cell)}
-    for key, alarm in (("max_discharge_a", "discharge_over_current"), ("max_charge_a", "charge_over_current")):
+    for key, alarm in (
+        ("max_discharge_a", "discharge_over_current"),
+        ("max_charge_a", "charge_over_current"),
+        ("tail_current_a", "charge_over_current"),
+    ):
         limit_a, alarm_a, file_a = getattr(settings.pack, key), alarms.get(alarm, math.inf), cell.cell.current_max_a
         if limit_a is not None and limit_a > min(alarm_a, file_a):
             lower = f"the alarm {alarm}" if alarm_a < file_a else "valid samples (current_max_a of the cell file)"
             yield (
-                f"pack.{key} = {limit_a:g}: above {min(alarm_a, file_a):.4g} A, the limit of {lower}, which bounds the "
-                "available power instead; is it the current of the whole pack?"
+                f"pack.{key} = {limit_a:g}: above {min(alarm_a, file_a):.4g} A, the limit of {lower}, which applies "
+                "instead; is it the current of the whole pack, in A?"
             )
 
 

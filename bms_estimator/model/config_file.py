@@ -71,6 +71,11 @@ MAX_LISTED_KEYS = 12
 
 MESSAGES = {
     "model_type": "must be a table, {key = value}",
+    "tuple_type": "must be a list, [value, ...]",
+    "string_type": "must be a text in quotes",
+    "string_too_short": "must not be empty",
+    "path_type": "must be a path in quotes",
+    "bool_type": "must be true or false",
     "string_pattern_mismatch": "is not of the form that it must have",
 }
 """Replacements for messages of pydantic that only programmers understand, by error type."""

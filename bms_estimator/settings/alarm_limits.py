@@ -184,14 +184,15 @@ def _implausible_limits(alarms: tuple[AlarmDefinition, ...], cell: PackModel) ->
         "discharge_over_current": (0.0, c.current_max_a),
         "charge_over_current": (0.0, c.current_max_a),
         **PLAUSIBLE_TEMPERATURES_C,
+        "cell_imbalance": (0.001, 1.0),
     }
     for alarm in alarms:
         low, high = ranges.get(alarm.name, (-math.inf, math.inf))
         if not low <= alarm.limit <= high:
             unit = alarm.kind.unit or ""
             hint = (
-                "the plausible range; is the value in degrees Fahrenheit?"
-                if alarm.name in PLAUSIBLE_TEMPERATURES_C
+                f"the plausible range; is the value in {'mV' if unit == 'V' else 'degrees Fahrenheit'}?"
+                if alarm.name in (*PLAUSIBLE_TEMPERATURES_C, "cell_imbalance")
                 else "the range of the cell file; is the value for one cell instead of the pack, or the reverse?"
             )
             key = f"alarms.{alarm.name}.limit_{unit[-1:].lower()}"  # limit_v, limit_a or limit_c

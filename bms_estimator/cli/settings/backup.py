@@ -71,19 +71,21 @@ def restore(file: Archive, pack: Pack) -> None:
         raise UserError(
             f"{file}: archive of the pack {archived.pack.name}, but {pack} has pack.name = {settings.pack.name}"
         )
+    for name in saved:
+        if not _state_file_pattern(settings.pack.name).fullmatch(name):
+            raise UserError(f"{file}: {name}: is not a file of the pack {settings.pack.name}")
     with _state_files(pack, settings) as (folder, existing):
         if existing:
             raise UserError(f"{existing[0]}: the pack has a state already; move it away to restore that of {file}")
+        with _user_errors(pack.parent):
+            pack.parent.mkdir(parents=True, exist_ok=True)
+            for name, data in {} if pack.exists() else {**files, pack.name: text.encode()}.items():
+                if not (pack.parent / name).exists():
+                    write_private(pack.parent / name, data)
         with _user_errors(folder):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             for name, data in saved.items():
-                if not _state_file_pattern(settings.pack.name).fullmatch(name):
-                    raise UserError(f"{file}: {name}: is not a file of the pack {settings.pack.name}")
                 write_private(folder / name, data)
-            if not pack.exists():
-                for name, data in {**files, pack.name: text.encode()}.items():
-                    if not (pack.parent / name).exists():
-                        write_private(pack.parent / name, data)
     typer.echo(f"{folder}: {len(saved)} files of the state of {settings.pack.name} restored; settings: {pack}")
 
 
