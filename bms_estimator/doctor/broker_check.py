@@ -27,7 +27,6 @@ RETAINED_TIMEOUT_S = 0.5
 ECHO_TIMEOUT_S = 2.0
 """Time within which a broker returns a message [s]."""
 TIMEOUTS = Timeouts(connect_s=4.0, acknowledge_s=3.0)
-SUSPICION_REMEDY = "correct the settings or the wiring, then restart the service"
 ACCESS_LIST_REMEDY = "correct the broker's access list, for Mosquitto: deploy/mosquitto/pack.acl"
 """Remedy for a denied topic."""
 
@@ -160,4 +159,4 @@ def _health_of_service(payload: bytes, silence_remedy: str) -> Iterator[Finding]
     else:
         yield ok(device_check.NAME, "samples arrive at the running service; not opened")
     for text in health.get("suspects", ()):
-        yield warning(device_check.NAME, text, SUSPICION_REMEDY)
+        yield warning(device_check.NAME, text, "correct the settings or the wiring, then restart the service")

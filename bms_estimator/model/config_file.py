@@ -65,7 +65,7 @@ class Strict(BaseModel):
 
 
 T = TypeVar("T", bound=BaseModel)
-MAX_LISTED_KEYS = 12
+MAX_LISTED_KEYS = 20
 """Maximum number of keys of a section that an error on an unknown key lists."""
 
 

@@ -20,15 +20,11 @@ from bms_estimator.setup.questions import cell_voltages, possible_counts, sugges
         ("nmc", 36.0, 10),
         ("nca", 3.7, 1),
         ("lto", 13.8, 6),
+        ("nmc", 0.4, None),  # below one cell
     ],
 )
-def test_usual_packs_are_recognized(cell: str, voltage_v: float, count: int) -> None:
+def test_usual_packs_are_recognized(cell: str, voltage_v: float, count: int | None) -> None:
     assert suggest_count(voltage_v, cell_voltages(cell)) == count
-
-
-def test_no_count_is_suggested_for_a_voltage_below_one_cell() -> None:
-    assert suggest_count(0.4, cell_voltages("nmc")) is None
-    assert not possible_counts(0.4, cell_voltages("nmc"))
 
 
 def test_possible_counts_end_where_a_cell_would_be_outside_its_voltages() -> None:

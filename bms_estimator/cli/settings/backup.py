@@ -58,7 +58,11 @@ def restore(file: Archive, pack: Pack) -> None:
     """
     # decompressed whole, because tarfile does not check the checksum at the end
     with _user_errors(file), tarfile.open(fileobj=io.BytesIO(gzip.decompress(file.read_bytes()))) as archive:
-        contents = {member.name: _read(archive, member) for member in archive.getmembers() if member.isfile()}
+        contents = {
+            member.name: (archive.extractfile(member) or io.BytesIO()).read()
+            for member in archive.getmembers()
+            if member.isfile()
+        }
     saved = {name.removeprefix(f"{STATE}/"): data for name, data in contents.items() if name.startswith(f"{STATE}/")}
     files = {Path(name).name: data for name, data in contents.items() if name.startswith(f"{SETTINGS}/")}
     if not saved or not files:
@@ -110,11 +114,6 @@ def _state_file_pattern(name: str) -> re.Pattern[str]:
     Another pack may be named ``NAME-0123abcd``, like a checkpoint of this pack. Its files have other suffixes.
     """
     return re.compile(rf"{re.escape(name)}(\.[a-z0-9.-]+|-[0-9a-f]{{8}}\.(((history|load)\.)?npz|changes-\d))")
-
-
-def _read(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
-    content = archive.extractfile(member)
-    return content.read() if content else b""
 
 
 @contextmanager

@@ -210,7 +210,11 @@ def cell_file(tmp_path):
         ),
         ({}, "series = 2\nfull_voltage_v = 84", "pack.full_voltage_v = 84: the OCV of"),
         ({}, "series = 2\ncutoff_voltage_v = 2.5", "pack.cutoff_voltage_v = 2.5: the OCV of"),
-        ({}, "tail_current_a = 150", "pack.tail_current_a = 150: above 3 A, the limit of the alarm charge_over_current"),
+        (
+            {},
+            "tail_current_a = 150",
+            "pack.tail_current_a = 150: above 3 A, the limit of the alarm charge_over_current",
+        ),
         ({}, "[alarms]\ncell_imbalance = {limit_v = 50}", "alarms.cell_imbalance.limit_v = 50: outside 0.001 to 1 V"),
         ({}, "series = 2\ncutoff_v = 7.6", "pack.cutoff_v = 7.6: the OCV of"),
         ({}, "series = 2\ncutoff_v = 3.3", "pack.cutoff_v = 3.3: the OCV of"),
