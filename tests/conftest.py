@@ -11,7 +11,7 @@ import structlog
 from hypothesis import HealthCheck, settings
 
 from bms_estimator.forecast import projection
-from bms_estimator.reports import svg_plot
+from bms_estimator.reports import report_parts
 from bms_estimator.service.kernel_warm_up import load_kernels
 from tests.full_disk import disk_without_files, full_disk
 from tests.mosquitto import broker
@@ -140,4 +140,4 @@ def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def empty_plots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave plots empty, for tests of the texts and tables of reports."""
-    monkeypatch.setattr(svg_plot, "_svg", lambda *_: "<svg></svg>")
+    monkeypatch.setattr(report_parts, "_svg", lambda *_: "<svg></svg>")

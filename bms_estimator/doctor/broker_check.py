@@ -150,7 +150,7 @@ async def _is_echoed(connection: Connection, topic: str) -> bool:
 
 
 def _health_of_service(payload: bytes, silence_remedy: str) -> Iterator[Finding]:
-    """Yield findings from the health message of the running service, on denied topics and on samples."""
+    """Yield findings from the health message of the running service: denied topics, samples and suspected faults."""
     try:
         health = json.loads(payload)
         topics, is_silent = health["refused_topics"], not health["sensor_online"]
@@ -165,3 +165,5 @@ def _health_of_service(payload: bytes, silence_remedy: str) -> Iterator[Finding]
         yield fault(device_check.NAME, f"no samples arrive: {health.get('sensor_message')}", silence_remedy)
     else:
         yield ok(device_check.NAME, "samples arrive at the running service; not opened")
+    for text in health.get("suspects", ()):
+        yield warning(device_check.NAME, text, "correct the settings or the wiring, then restart the service")

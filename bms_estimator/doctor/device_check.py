@@ -102,10 +102,18 @@ def check_device(subject: ExaminedPack) -> Iterator[Finding]:
     except NoSampleError as error:
         yield fault(NAME, str(error), silence_remedy(subject))
         return
-    yield ok(NAME, f"{name}: {sample}")
+    series = subject.model.cell.series_count
+    others = [
+        str(n)
+        for n in (series - 1, series + 1)
+        if n
+        and not sample.cells
+        and not implausible_measurement(subject.model, sample.voltage_v * series / n, sample.current_a, math.nan)
+    ]
+    doubt = f"; without cell voltages, {' or '.join(others)} in series cannot be excluded" if others else ""
+    yield ok(NAME, f"{name}: {sample}{doubt}")
     for text in implausible_measurement(subject.model, sample.voltage_v, sample.current_a, sample.capacity_ah):
         yield warning(NAME, text, f"edit {subject.path}, then: bms-estimator config check {subject.path}")
-    series = subject.model.cell.series_count
     if sample.cells != series and (sample.cells or subject.settings.bms):
         text = f"{sample.cells} cells are measured, but the pack has {series} in series"
         yield warning(NAME, text, "correct pack.series, or measure the other cells")

@@ -96,7 +96,7 @@ CHECKPOINTS_MB = 10.0
 def check_disk(subject: ExaminedPack) -> Iterator[Finding]:
     """Yield findings on the permissions of the state folder, and on the disk space for the history."""
     folder = subject.state_folder
-    existing = _nearest_existing(folder)
+    existing = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
     if not os.access(existing, os.R_OK | os.W_OK | os.X_OK):
         if subject.unit:  # the folder belongs to the service's user
             yield warning(DISK, f"{folder}: cannot be read by this user; not checked", subject.command_as_root)
@@ -105,7 +105,7 @@ def check_disk(subject: ExaminedPack) -> Iterator[Finding]:
             yield fault(DISK, f"{existing}: this user may not write it", remedy)
         return
     free_mb = shutil.disk_usage(existing).free / 1e6
-    used_mb = _size_mb(folder)
+    used_mb = sum(file.stat().st_size for file in folder.glob("*") if file.is_file()) / 1e6
     needed_mb = CHECKPOINTS_MB + max(HISTORY_MB_PER_DAY * subject.settings.store.history_days - used_mb, 0.0)
     text = f"{folder}: {used_mb:.0f} MB used, {free_mb:,.0f} MB free"
     if free_mb < CHECKPOINTS_MB:
@@ -115,16 +115,6 @@ def check_disk(subject: ExaminedPack) -> Iterator[Finding]:
         yield warning(DISK, text, "free some space, or set a smaller store.history_days")
     else:
         yield ok(DISK, text)
-
-
-def _nearest_existing(folder: Path) -> Path:
-    """Return the folder, or its nearest parent that exists."""
-    return next(each for each in (folder, *folder.parents) if os.path.lexists(each))
-
-
-def _size_mb(folder: Path) -> float:
-    """Return the size of all files in a folder [MB]; 0 if it does not exist."""
-    return sum(file.stat().st_size for file in folder.glob("*") if file.is_file()) / 1e6
 
 
 PACKAGES = ("numba", "numpy", "aiomqtt", "pydantic", "pyserial")

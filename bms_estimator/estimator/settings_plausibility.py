@@ -107,6 +107,40 @@ def implausible_measurement(cell: PackModel, voltage_v: float, current_a: float,
     )
 
 
+class Contradictions:
+    """Settings that the first values of a device contradict, until its values at rest agree with them.
+
+    Later values are not compared as long as the first agree, because a pack that was just charged or is empty has such a voltage.
+
+    Args:
+        cell: Model of the whole pack.
+
+    Attributes:
+        texts: One line for each setting, with the values of the first comparison.
+    """
+
+    def __init__(self, cell: PackModel) -> None:
+        self._cell, self._device_ah, self._is_compared = cell, math.nan, False
+        self.texts = list[str]()
+
+    def add(self, voltage_v: float, current_a: float, device_ah: float) -> bool:
+        """Compare the values of a sample. Return True for those of the first sample, and the first capacity of the device.
+
+        Args:
+            voltage_v: Voltage of the pack [V]; NaN: unknown.
+            current_a: Current [A]; NaN: unknown.
+            device_ah: Capacity that the device reports [Ah]; NaN: unknown.
+        """
+        has_first_capacity = math.isnan(self._device_ah) and not math.isnan(device_ah)
+        is_first = not math.isnan(voltage_v) and (not self._is_compared or has_first_capacity)
+        self._device_ah = self._device_ah if math.isnan(device_ah) else device_ah
+        if is_first or (self.texts and abs(current_a) <= MAX_RESTING_C * self._cell.one_c_a):
+            lines = implausible_measurement(self._cell, voltage_v, current_a, self._device_ah)
+            lasts = [text for text in self.texts if any(line.split()[0] == text.split()[0] for line in lines)]
+            self.texts, self._is_compared = lines if is_first else lasts, True
+        return is_first
+
+
 def _contradictions(cell: CellModel, voltage_v: float, current_a: float, device_ah: float) -> Iterator[str]:
     capacity_ah, series = cell.cell.capacity_ah, cell.cell.series_count
     if abs(device_ah - capacity_ah) > CAPACITY_TOLERANCE * max(device_ah, capacity_ah):
@@ -135,13 +169,12 @@ def _battery_lines(settings: Settings, cell: CellModel) -> Iterator[str | None]:
         _series_counted_twice,
         _implausible_cell_voltage,
         _missing_parallel,
-        _full_voltage_off_curve,
-        _cutoff_voltage_off_curve,
         _implausible_load_cutoff,
         _more_cells_than_series,
     )
     yield from (check(settings, cell) for check in checks)
     yield _voltage_out_of_range(settings, float(ocv_grid(cell)[0][-1]), "when full")
+    yield from _end_voltages_off_curve(settings, cell)
     yield from _current_limits_without_effect(settings, cell)
 
 
@@ -157,63 +190,54 @@ def _stack_lines(settings: Settings, cell: FuelCellModel) -> Iterator[str | None
 
 def _too_large_capacity(settings: Settings, cell: CellModel) -> str | None:
     capacity_ah = cell.cell.capacity_ah / settings.pack.parallel
-    if capacity_ah <= MAX_CAPACITY_AH:
-        return None
     section = "cell" if settings.pack.capacity_ah is None else "pack"
-    return f"{section}.capacity_ah = {capacity_ah:g}: no cell holds more than {MAX_CAPACITY_AH:g} Ah; is it in mAh?"
+    text = f"{section}.capacity_ah = {capacity_ah:g}: no cell holds more than {MAX_CAPACITY_AH:g} Ah; is it in mAh?"
+    return text if capacity_ah > MAX_CAPACITY_AH else None
 
 
 def _series_counted_twice(settings: Settings, cell: CellModel) -> str | None:
     series = settings.pack.series
     file_series = cell.cell.series_count // series  # ``cell`` is the whole pack
-    if series == 1 or file_series == 1:
-        return None
-    return (
+    text = (
         f"pack.series = {series}: the cell file is of {file_series} cells in series already (series_count), which makes "
         f"{cell.cell.series_count}; is the file the whole pack, and series 1?"
     )
+    return text if series > 1 and file_series > 1 else None
 
 
 def _implausible_cell_voltage(_: Settings, cell: CellModel) -> str | None:
     cell_v = cell.cell.nominal_voltage_v / cell.cell.series_count
-    if PLAUSIBLE_CELL_V[0] <= cell_v <= PLAUSIBLE_CELL_V[1]:
-        return None
-    return (
+    text = (
         f"{cell.cell.nominal_voltage_v:g} V nominal of {cell.cell.series_count} in series: {cell_v:.3g} V a cell, but "
         f"Li-ion cells have {PLAUSIBLE_CELL_V[0]:g} to {PLAUSIBLE_CELL_V[1]:g} V; is series_count of the cell file right?"
     )
+    return None if PLAUSIBLE_CELL_V[0] <= cell_v <= PLAUSIBLE_CELL_V[1] else text
 
 
 def _missing_parallel(settings: Settings, cell: CellModel) -> str | None:
     c = cell.cell
-    if settings.pack.parallel > 1 or c.capacity_ah > SMALL_CELL_AH or c.series_count <= MAX_SINGLE_ROW:
-        return None
-    return f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
+    is_single_row = settings.pack.parallel == 1 and c.capacity_ah <= SMALL_CELL_AH and c.series_count > MAX_SINGLE_ROW
+    text = f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
+    return text if is_single_row else None
 
 
-def _full_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None:
-    limits = settings.charge_limits
+def _end_voltages_off_curve(settings: Settings, cell: CellModel) -> Iterator[str]:
+    """Yield a line for the full voltage and for the cut-off voltage of the protection, if they correct no SOC."""
+    limits, c = settings.charge_limits, cell.cell
     ocv_v = ocv_grid(between_limits(cell, limits))[0]
-    soc = soc_at_full(ocv_v, limits)
-    if soc >= MIN_FULL_SOC:
-        return None
-    return (
-        f"pack.full_voltage_v = {limits.full_voltage_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there and SOC 1 at "
-        f"{ocv_v[-1]:.2f} V, so that the end of a charge does not correct the SOC; is it the voltage of the whole pack? If the "
-        "charger ends there, make a cell file from charges to this voltage (bms-estimator ocv)"
-    )
-
-
-def _cutoff_voltage_off_curve(settings: Settings, cell: CellModel) -> str | None:
-    limits = settings.charge_limits
-    ocv_v = ocv_grid(between_limits(cell, limits))[0]
-    soc = soc_at_cutoff(ocv_v, limits)
-    if soc <= MAX_EMPTY_SOC:
-        return None
-    return (
-        f"pack.cutoff_voltage_v = {limits.cutoff_voltage_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there and SOC 0 "
-        f"at {ocv_v[0]:.2f} V, so that the end of a discharge does not correct the SOC; is it the voltage of the whole pack?"
-    )
+    full_soc, empty_soc = soc_at_full(ocv_v, limits), soc_at_cutoff(ocv_v, limits)
+    full_v, cutoff_v = limits.full_voltage_v, limits.cutoff_voltage_v
+    for key, value_v, soc, is_off, end in (
+        ("full", full_v, full_soc, full_soc < MIN_FULL_SOC or (full_v or 0.0) > c.voltage_max_v, -1),
+        ("cutoff", cutoff_v, empty_soc, empty_soc > MAX_EMPTY_SOC or (cutoff_v or math.inf) < c.voltage_min_v, 0),
+    ):
+        if is_off:
+            yield (
+                f"pack.{key}_voltage_v = {value_v:g}: the OCV of {c.name} has SOC {soc:.2f} there and SOC {-end} at "
+                f"{ocv_v[end]:.2f} V, so that the end of a {'charge' if end else 'discharge'} does not correct the SOC; is it the "
+                "voltage of the whole pack, and pack.series right? If the pack ends there, make a cell file to this voltage "
+                "(bms-estimator ocv)"
+            )
 
 
 def _implausible_load_cutoff(settings: Settings, cell: CellModel) -> str | None:
@@ -243,13 +267,17 @@ def _more_cells_than_series(settings: Settings, cell: CellModel) -> str | None:
 def _current_limits_without_effect(settings: Settings, cell: CellModel) -> Iterator[str]:
     """Yield a line for each current limit above the limit of an alarm or of the cell file, which then applies."""
     alarms: dict[str, float] = {alarm.name: alarm.limit for alarm in monitored_alarms(settings, cell)}
-    for key, alarm in (("max_discharge_a", "discharge_over_current"), ("max_charge_a", "charge_over_current")):
+    for key, alarm in (
+        ("max_discharge_a", "discharge_over_current"),
+        ("max_charge_a", "charge_over_current"),
+        ("tail_current_a", "charge_over_current"),
+    ):
         limit_a, alarm_a, file_a = getattr(settings.pack, key), alarms.get(alarm, math.inf), cell.cell.current_max_a
         if limit_a is not None and limit_a > min(alarm_a, file_a):
             lower = f"the alarm {alarm}" if alarm_a < file_a else "valid samples (current_max_a of the cell file)"
             yield (
-                f"pack.{key} = {limit_a:g}: above {min(alarm_a, file_a):.4g} A, the limit of {lower}, which bounds the "
-                "available power instead; is it the current of the whole pack?"
+                f"pack.{key} = {limit_a:g}: above {min(alarm_a, file_a):.4g} A, the limit of {lower}, which applies "
+                "instead; is it the current of the whole pack, in A?"
             )
 
 

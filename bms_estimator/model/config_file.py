@@ -94,12 +94,17 @@ class Strict(BaseModel):
 
 
 T = TypeVar("T", bound=BaseModel)
-MAX_LISTED_KEYS = 12
+MAX_LISTED_KEYS = 20
 """Maximum number of keys of a section that an error on an unknown key lists."""
 
 
 MESSAGES = {
     "model_type": "must be a table, {key = value}",
+    "tuple_type": "must be a list, [value, ...]",
+    "string_type": "must be a text in quotes",
+    "string_too_short": "must not be empty",
+    "path_type": "must be a path in quotes",
+    "bool_type": "must be true or false",
     "string_pattern_mismatch": "is not of the form that it must have",
 }
 """Replacements for messages of pydantic that only programmers understand, by error type."""

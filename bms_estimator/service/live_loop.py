@@ -15,8 +15,8 @@ import structlog
 from bms_estimator.checkpoint.run_file import RunCounters, SavedRun
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.edge.block_sender import BlockSender
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.settings_plausibility import implausible_measurement
+from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.estimator.settings_plausibility import Contradictions
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.pack_model import PackModel
@@ -197,7 +197,7 @@ async def run_estimation_loop(
         stack.enter_context(acknowledge_on_signal(monitor.acknowledge_on_signal))
         notifier.ready(name)
         tasks = [
-            _estimate(source, model, pack, slots, totals, publisher, parts.edge, restored_s),
+            _estimate(source, pack, slots, totals, publisher, parts.edge, restored_s, status),
             _keep_alive(publisher, status, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -221,34 +221,33 @@ async def run_estimation_loop(
 
 async def _estimate(
     source: Source,
-    model: PackModel,
     pack: Pack,
     slots: CellSlots,
     totals: LifetimeTotals,
     publisher: Publisher,
     edge: BlockSender | None,
     restored_s: float,
+    status: ServiceStatus,
 ) -> None:
     """Pass each block of samples to the edge, the pack, the totals and the publisher.
 
     Args:
         source: Supplies the blocks.
-        model: Model of the whole pack, which is compared with the first values of the device.
         pack: The pack.
         slots: Cell slots of the source.
         totals: Lifetime totals.
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.
         restored_s: Time since boot at which the state was restored [s].
+        status: State of the service, to which the contradictions between settings and device are written.
     """
-    logged_reason, before_s, checked_ah = "", restored_s, None
+    logged_reason, before_s, contradictions = "", restored_s, Contradictions(pack.model)
     async for each in source:
-        device_ah = each.device_capacity_ah
-        if checked_ah is None or (math.isnan(checked_ah) and not math.isnan(device_ah)):
-            checked_ah = device_ah
-            for voltage_v, current_a in each.samples[-1:][["voltage_v", "current_a"]].tolist():
-                for text in implausible_measurement(model, voltage_v, current_a, device_ah):
+        for voltage_v, current_a in each.samples[-1:][["voltage_v", "current_a"]].tolist():
+            if contradictions.add(voltage_v, current_a, each.device_capacity_ah):
+                for text in contradictions.texts:
                     log.warning("implausible setting", reason=text)
+        status.contradictions = contradictions.texts
         received = each._replace(cells_v=slots.select(each.cells_v))
         if slots.reason != logged_reason:
             logged_reason = slots.reason

@@ -20,6 +20,7 @@ from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.definitions import Change
 from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload, remaining_capacity_ah
 from bms_estimator.telemetry.health import (
+    DEVICE_SOC_SUSPICION,
     contradicts_device,
     dropped_text,
     make_health_payload,
@@ -304,7 +305,7 @@ class Publisher:
             edge=status.edge(),
             hooks=status.hooks(),
             pack_model=pack_model_health(slow_fit, status.fit_times()) if slow_fit else None,
-            contradicts_device=self._contradiction,
+            contradictions=[*status.contradictions, *[DEVICE_SOC_SUSPICION] * self._contradiction],
         )
 
     def _log_input_faults(self, health: Health) -> None:

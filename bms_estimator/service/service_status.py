@@ -1,7 +1,7 @@
 """State of the service for the topic ``health``, and the latency of its blocks."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from bms_estimator.model.payloads.health import EdgeHealth, HookHealth, RecordingHealth
@@ -71,6 +71,8 @@ class ServiceStatus:
     """Returns end and duration of the last fit."""
     restarts: int = 0
     """Number of starts that found files of an earlier run."""
+    contradictions: Sequence[str] = ()
+    """Settings that the values of the device contradict, one line each."""
     checkpoint: str = "off"
     """Outcome of the last restore or save of a checkpoint."""
     disk_free_mib: float | None = None

@@ -55,13 +55,17 @@ class VoltageLimits(NamedTuple):
     over_clear_v: float
     under_v: float
     under_clear_v: float
+    steep_v: float
+    """Voltage of the highest cell from which the cells are not compared [V]; infinite: they always are. At the steep end of a charge
+    balanced LFP cells differ by more than the limit of ``cell_imbalance``. Below 3.38 V they do not, because the flat part of the
+    OCV curve before it has 3.34 V."""
 
 
 _VOLTAGE_LIMITS = (
-    # over_v, over_clear_v, under_v, under_clear_v
-    (2.8, VoltageLimits(2.85, 2.70, 1.60, 1.90)),  # LTO: charged to 2.7..2.8 V, empty at 1.5 V
-    (3.45, VoltageLimits(3.65, 3.40, 2.70, 3.10)),  # LFP: factory settings of the Seplos BMS 3.0
-    (math.inf, VoltageLimits(4.25, 4.15, 2.70, 3.00)),  # all chemistries that are charged to 4.2 V
+    # over_v, over_clear_v, under_v, under_clear_v, steep_v
+    (2.8, VoltageLimits(2.85, 2.70, 1.60, 1.90, math.inf)),  # LTO: charged to 2.7..2.8 V, empty at 1.5 V
+    (3.45, VoltageLimits(3.65, 3.40, 2.70, 3.10, 3.38)),  # LFP: factory settings of the Seplos BMS 3.0
+    (math.inf, VoltageLimits(4.25, 4.15, 2.70, 3.00, math.inf)),  # all chemistries that are charged to 4.2 V
 )
 """Pairs of a maximum nominal voltage of a cell [V] and the limits of cells up to this nominal voltage. The first pair that
 matches applies."""
@@ -160,7 +164,7 @@ def balancing_voltage_v(cell: PackModel) -> float:
     Args:
         cell: Model of the whole pack.
     """
-    return _voltage_limits(cell).over_v - BALANCING_BELOW_V
+    return voltage_limits(cell).over_v - BALANCING_BELOW_V
 
 
 def implausible_limits(settings: Settings, cell: PackModel) -> list[str]:
@@ -179,14 +183,15 @@ def _implausible_limits(alarms: tuple[AlarmDefinition, ...], cell: PackModel) ->
         "discharge_over_current": (0.0, c.current_max_a),
         "charge_over_current": (0.0, c.current_max_a),
         **PLAUSIBLE_TEMPERATURES_C,
+        "cell_imbalance": (0.001, 1.0),
     }
     for alarm in alarms:
         low, high = ranges.get(alarm.name, (-math.inf, math.inf))
         if not low <= alarm.limit <= high:
             unit = alarm.kind.unit or ""
             hint = (
-                "the plausible range; is the value in degrees Fahrenheit?"
-                if alarm.name in PLAUSIBLE_TEMPERATURES_C
+                f"the plausible range; is the value in {'mV' if unit == 'V' else 'degrees Fahrenheit'}?"
+                if alarm.name in (*PLAUSIBLE_TEMPERATURES_C, "cell_imbalance")
                 else "the range of the cell file; is the value for one cell instead of the pack, or the reverse?"
             )
             key = f"alarms.{alarm.name}.limit_{unit[-1:].lower()}"  # limit_v, limit_a or limit_c
@@ -254,14 +259,15 @@ def _weak_cell_default(settings: Settings) -> _Default:
     return _Default(limit, WEAK_CELL_CLEAR_FRACTION * limit)
 
 
-def _voltage_limits(cell: PackModel) -> VoltageLimits:
+def voltage_limits(cell: PackModel) -> VoltageLimits:
+    """Return the default voltage limits of a cell of a pack."""
     nominal_v = cell.cell.nominal_voltage_v / cell.cell.series_count
     return next(limits for max_nominal_v, limits in _VOLTAGE_LIMITS if nominal_v < max_nominal_v)
 
 
 def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
     c, n = cell.cell, cell.cell.series_count
-    v = _voltage_limits(cell)
+    v = voltage_limits(cell)
     short_a = MIN_SHORT_C * c.capacity_ah
     can_compare = n >= MIN_CELLS
     charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less

@@ -4,7 +4,6 @@ The number of cells in series is suggested from the measured voltage and the che
 """
 
 import math
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +14,7 @@ from bms_estimator.estimator.settings_plausibility import ABOVE_FULL_V, BELOW_EM
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.model.cell import generic_cells, load_cell, shipped_cells
 from bms_estimator.model.config_file import error_reason, without_secrets
-from bms_estimator.settings.pack import DEVICE_NAME, PackSettings
+from bms_estimator.settings.pack import PackSettings
 from bms_estimator.setup.answers import Answers, InvalidAnswerError, parse_number
 from bms_estimator.setup.broker_login import ADDRESS_FORM, BrokerLogin
 
@@ -81,10 +80,8 @@ SYNONYMS = {
     for synonym in description.partition(":")[0].split(", ")
 }
 """Names of the generic cells by the names in their descriptions, in lower case."""
-NO_BROKER = "none"
-"""Answer for a service that publishes nothing over MQTT."""
-NO_LIMIT = "none"
-"""Answer for a voltage or current without a configured limit, and for a device whose SOC is not used."""
+NONE = "none"
+"""Answer for a service without a broker, a voltage or current without a configured limit, and a device whose SOC is not used."""
 DEFAULT_DEVICE_SOC_STD = "10"
 """Default standard deviation of the SOC that a device reports [%], a usual drift of coulomb counters between two full charges."""
 
@@ -137,12 +134,6 @@ def _validated(model: type[BaseModel], key: str, value: object) -> object:
         detail = error.errors()[0]
         description = model.model_fields[key].description
         raise InvalidAnswerError(f"{without_secrets(str(value))}: {error_reason(detail)} ({description})") from None
-
-
-def _parse_name(text: str, _: Answers) -> object:
-    if not re.fullmatch(DEVICE_NAME, text):
-        raise InvalidAnswerError(f"{text}: must be 1 to 64 of the characters A-Z, a-z, 0-9, _ and -")
-    return text
 
 
 def _parse_cell(text: str, answers: Answers) -> object:
@@ -201,7 +192,7 @@ def _suggest_limit_v(answers: Answers, index: int) -> str:
     if answers.cell is None or answers.series is None:
         return ""
     if answers.cell not in USUAL_LIMITS_V:
-        return NO_LIMIT
+        return NONE
     return f"{answers.series * USUAL_LIMITS_V[answers.cell][index]:g}"
 
 
@@ -215,7 +206,7 @@ def _suggest_capacity(answers: Answers) -> str:
 
 
 def _parse_broker(text: str, answers: Answers) -> object:
-    if text == NO_BROKER:
+    if text == NONE:
         return None
     try:
         login = BrokerLogin.parse(text)
@@ -227,7 +218,7 @@ def _parse_broker(text: str, answers: Answers) -> object:
 
 def _suggest_broker(answers: Answers) -> str:
     found = answers.device.broker or answers.found_broker
-    return found.url if found else NO_BROKER
+    return found.url if found else NONE
 
 
 def _suggest_series(answers: Answers) -> str:
@@ -250,7 +241,7 @@ QUESTIONS = (
         "name",
         "Name of the pack",
         "name of the pack, also in MQTT topics: letters, digits, _ and -",
-        _parse_name,
+        lambda text, _: _validated(PackSettings, "name", text),
         lambda answers: answers.name or "pack",
     ),
     Question(
@@ -286,9 +277,9 @@ QUESTIONS = (
     Question(
         "full_voltage_v",
         "Voltage of the pack at which its charger stops [V]",
-        f"voltage of the pack at which its charger stops, which is 100 % [V]; {NO_LIMIT}: that of the cell file",
+        f"voltage of the pack at which its charger stops, which is 100 % [V]; {NONE}: that of the cell file",
         lambda text, answers: (
-            None if text == NO_LIMIT else _parse_limit_v("full_voltage_v", text, answers, above_middle=True)
+            None if text == NONE else _parse_limit_v("full_voltage_v", text, answers, above_middle=True)
         ),
         lambda answers: _suggest_limit_v(answers, 0),
         explanation="The SOC is 100 % at this voltage: see the charger's manual. If the charger does not reach it, 100 % is never reported.",
@@ -297,9 +288,9 @@ QUESTIONS = (
     Question(
         "cutoff_voltage_v",
         "Voltage of the pack at which its BMS ends a discharge [V]",
-        f"voltage of the pack at which its BMS ends a discharge, which is 0 % [V]; {NO_LIMIT}: that of the cell file",
+        f"voltage of the pack at which its BMS ends a discharge, which is 0 % [V]; {NONE}: that of the cell file",
         lambda text, answers: (
-            None if text == NO_LIMIT else _parse_limit_v("cutoff_voltage_v", text, answers, above_middle=False)
+            None if text == NONE else _parse_limit_v("cutoff_voltage_v", text, answers, above_middle=False)
         ),
         lambda answers: _suggest_limit_v(answers, 1),
         explanation="This is 0 %: see the settings of the BMS.",
@@ -308,34 +299,32 @@ QUESTIONS = (
     Question(
         "max_discharge_a",
         "Largest discharge current of the pack by its rating or its BMS [A]",
-        f"largest discharge current of the pack [A]; {NO_LIMIT}: unknown",
-        lambda text, _: (
-            None if text == NO_LIMIT else _validated(PackSettings, "max_discharge_a", parse_number(text, "A"))
-        ),
-        lambda _: NO_LIMIT,
+        f"largest discharge current of the pack [A]; {NONE}: unknown",
+        lambda text, _: None if text == NONE else _validated(PackSettings, "max_discharge_a", parse_number(text, "A")),
+        lambda _: NONE,
     ),
     Question(
         "max_charge_a",
         "Largest charge current of the pack by its rating or its BMS [A]",
-        f"largest charge current of the pack [A]; {NO_LIMIT}: unknown",
-        lambda text, _: None if text == NO_LIMIT else _validated(PackSettings, "max_charge_a", parse_number(text, "A")),
-        lambda _: NO_LIMIT,
+        f"largest charge current of the pack [A]; {NONE}: unknown",
+        lambda text, _: None if text == NONE else _validated(PackSettings, "max_charge_a", parse_number(text, "A")),
+        lambda _: NONE,
     ),
     Question(
         "device_soc_std",
         "How far may the SOC of the device be wrong [%]",
-        f"standard deviation of the SOC that the device reports, from which the estimate starts [%]; {NO_LIMIT}: it is not used",
+        f"standard deviation of the SOC that the device reports, from which the estimate starts [%]; {NONE}: it is not used",
         lambda text, _: (
-            None if text == NO_LIMIT else _validated(PackSettings, "device_soc_std", parse_number(text, "%") / 100.0)
+            None if text == NONE else _validated(PackSettings, "device_soc_std", parse_number(text, "%") / 100.0)
         ),
-        lambda answers: DEFAULT_DEVICE_SOC_STD if _reports_soc(answers) else NO_LIMIT,
+        lambda answers: DEFAULT_DEVICE_SOC_STD if _reports_soc(answers) else NONE,
         explanation="The estimate starts from this SOC, with the error that you give as its standard deviation.",
         is_asked=_reports_soc,
     ),
     Question(
         "broker",
         "MQTT broker to publish to",
-        f"URL of the MQTT broker to which the service publishes, {ADDRESS_FORM}; {NO_BROKER}: no broker",
+        f"URL of the MQTT broker to which the service publishes, {ADDRESS_FORM}; {NONE}: no broker",
         _parse_broker,
         _suggest_broker,
     ),

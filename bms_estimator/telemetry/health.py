@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -196,7 +196,7 @@ def make_health_payload(
     edge: EdgeHealth | None = None,
     hooks: HookHealth | None = None,
     pack_model: PackModelHealth | None = None,
-    contradicts_device: bool = False,
+    contradictions: Sequence[str] = (),
 ) -> Health:
     """Return the payload of topic ``health``.
 
@@ -219,7 +219,7 @@ def make_health_payload(
         edge: State of the fleet edge; None without an edge.
         hooks: Successes and failures of alarm hooks; None without hooks.
         pack_model: State of the slow fit; None without a slow fit.
-        contradicts_device: True: ``suspects`` contains ``DEVICE_SOC_SUSPICION``.
+        contradictions: Further texts of ``suspects``: contradictions between the device and settings or estimate.
     """
     state = record["observer"]
     return Health(
@@ -235,7 +235,7 @@ def make_health_payload(
         line={name: int(count) for name, count in source_counters.items() if name != "reconnects"},
         samples=sample_counters(state),
         identifier=identifier_counters(record),
-        suspects=suspicions(record, settings) + [DEVICE_SOC_SUSPICION] * contradicts_device,
+        suspects=[*suspicions(record, settings), *contradictions],
         anchor=last_anchor(record),
         lock_losses=int(state["lock_losses"]),
         gain_rearms=int(state["gain_rearms"]),

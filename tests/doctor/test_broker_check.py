@@ -75,13 +75,16 @@ def test_the_access_list_of_the_docs_suffices(tmp_path: Path, restricted_broker:
 async def test_a_running_service_reports_denied_topics_and_is_not_disturbed(tmp_path: Path, broker: Broker) -> None:
     async with Listener(broker) as service:
         await service.publish("bms/house/availability", b"online", retain=True, qos=1)
-        health = b'{"refused_topics": ["bms/house/state"], "sensor_online": true}'
+        health = (
+            b'{"refused_topics": ["bms/house/state"], "sensor_online": true, "suspects": ["pack.series = 8: 52.80 V"]}'
+        )
         await service.publish("bms/house/health", health, retain=True, qos=1)
         findings = await asyncio.to_thread(lambda: list(check_broker(pack_at(tmp_path, broker.url))))
         await service.publish("end")
         await service.wait("end")
         assert service.all("bms/house/availability") == [b"online"]
-    assert levels(findings) == [Level.OK, Level.FAULT, Level.OK]
+    assert levels(findings) == [Level.OK, Level.FAULT, Level.OK, Level.WARNING]
+    assert findings[3].text == "pack.series = 8: 52.80 V"
     assert findings[1].text == "the broker denies the running service: bms/house/state"
 
 

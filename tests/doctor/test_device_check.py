@@ -45,7 +45,10 @@ def board_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 def test_a_board_that_answers_is_reported_with_its_values(tmp_path: Path, board_port: str) -> None:
     device, board = check_device(subject(tmp_path, sensor={"port": board_port}))
     assert device.level is Level.OK
-    assert re.fullmatch(rf"{board_port}: 13\.[12]\d+ V, 0\.\d+ A; firmware 0\.2\.0, serial 0000002a", device.text)
+    assert re.fullmatch(
+        rf"{board_port}: 13\.[12]\d+ V, 0\.\d+ A; firmware 0\.2\.0, serial 0000002a; without cell voltages, 5 in series cannot be excluded",
+        device.text,
+    )
     assert (board.check, board.level) == ("board", Level.WARNING)
     assert "--aref-v" in board.remedy
     assert not (tmp_path / "state").exists()  # nothing is written

@@ -232,6 +232,8 @@ async def test_a_change_that_lowers_the_bound_of_the_std_by_a_fifth_is_named(
             }""",
                 ends,
             )
+        await publish(programs.live, "health", json.dumps(health | {"suspects": ["pack.series = 8: 52.80 V"]}))
+        await page_tab.page.get_by_text("pack.series = 8: 52.80 V").wait_for()
         await publish(programs.live, "health", json.dumps(health))
         assert page_tab.errors == []
 

@@ -21,7 +21,7 @@ import structlog
 
 from bms_estimator.checkpoint.run_file import RunCounters, add_checksum
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.clock import Clock
@@ -373,7 +373,7 @@ def test_only_a_pack_that_is_surely_another_one_starts_beside_an_alarm_without_o
     assert bool(StateFiles(folder, settings_on("new", later), CELL).run_file.load().lost_reason) == is_raised
 
 
-async def test_settings_that_the_first_values_contradict_are_logged_once(tmp_path: Path) -> None:
+async def test_settings_that_the_first_values_contradict_are_logged_once_and_stay_in_health(tmp_path: Path) -> None:
     with structlog.testing.capture_logs() as lines:
         async with running(StateFiles(tmp_path, SETTINGS, CELL)) as (source, sink):
             for time_s in range(3):
@@ -381,6 +381,7 @@ async def test_settings_that_the_first_values_contradict_are_logged_once(tmp_pat
             await sink.until(lambda s: s.estimate is not None)
     reasons = [line["reason"] for line in lines if line["event"] == "implausible setting"]
     assert [reason.partition(" ")[0] for reason in reasons] == ["pack.capacity_ah:", "pack.series"]
+    assert sink.snapshots[-1].health.suspects == reasons
 
 
 async def test_an_alarm_that_is_disabled_while_it_is_raised_needs_an_acknowledgement(folder: Path) -> None:

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from bms_estimator.estimator.settings_plausibility import implausible_measurement
+from bms_estimator.estimator.settings_plausibility import Contradictions, implausible_measurement
 from bms_estimator.model.cell import load_cell
 from bms_estimator.setup.questions import cell_voltages, possible_counts, suggest_count
 
@@ -20,15 +20,11 @@ from bms_estimator.setup.questions import cell_voltages, possible_counts, sugges
         ("nmc", 36.0, 10),
         ("nca", 3.7, 1),
         ("lto", 13.8, 6),
+        ("nmc", 0.4, None),  # below one cell
     ],
 )
-def test_usual_packs_are_recognized(cell: str, voltage_v: float, count: int) -> None:
+def test_usual_packs_are_recognized(cell: str, voltage_v: float, count: int | None) -> None:
     assert suggest_count(voltage_v, cell_voltages(cell)) == count
-
-
-def test_no_count_is_suggested_for_a_voltage_below_one_cell() -> None:
-    assert suggest_count(0.4, cell_voltages("nmc")) is None
-    assert not possible_counts(0.4, cell_voltages("nmc"))
 
 
 def test_possible_counts_end_where_a_cell_would_be_outside_its_voltages() -> None:
@@ -60,3 +56,19 @@ def test_a_voltage_that_the_cells_cannot_have_is_reported(
     lines = implausible_measurement(load_cell(cell, 100.0).pack(series, 1), voltage_v, current_a, math.nan)
     assert len(lines) == bool(text)
     assert text in "".join(lines)
+
+
+def test_a_contradiction_lasts_until_a_voltage_at_rest_agrees_with_the_settings() -> None:
+    contradictions = Contradictions(load_cell("lfp", 100.0).pack(15, 1))
+    names = []
+    for voltage_v, current_a, device_ah in (
+        (math.nan, 0.0, math.nan),
+        (53.8, 0.0, math.nan),  # just charged
+        (50.0, 30.0, 200.0),  # the device reports its capacity; a load has no contradiction
+        (53.8, 0.0, math.nan),  # not compared again, but for the capacity
+        (49.8, 0.0, math.nan),
+        (49.8, 0.0, 100.0),
+    ):
+        contradictions.add(voltage_v, current_a, device_ah)
+        names.append([text.split()[0] for text in contradictions.texts])
+    assert names == [[], ["pack.series"], ["pack.capacity_ah:"], ["pack.capacity_ah:"], ["pack.capacity_ah:"], []]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.alarms.evaluate import update_alarm
 from bms_estimator.kernels.alarms.records import ALARMS as STATES
 from bms_estimator.kernels.alarms.records import EVALUATION_IO, LIMITS, LOG, RAISED, SETTINGS
@@ -192,6 +192,14 @@ async def test_a_healthy_pack_raises_no_alarm_and_alarms_of_unmeasured_quantitie
         "under_temperature",
         "charging_below_freezing",
     }
+
+
+async def test_cells_of_lfp_are_compared_only_below_the_steep_end_of_a_charge(tmp_path: Path) -> None:
+    """Balanced cells differ at the end of each charge; a cell that falls behind under load or near empty is weak."""
+    full, weak = Line(80, 6.90, -5.0, cells_v=(3.50, 3.40)), Line(80, 6.50, 5.0, cells_v=(3.28, 3.22))
+    path = record(tmp_path / "capture.bms", [Line(10, 6.60, cells_v=(3.30, 3.30)), full, weak])
+    result = await replayed(path, settings(), load_cell("lfp", 10.0).pack(2, 1))
+    assert result.transitions("cell_imbalance") == [(pytest.approx(150.0, abs=1.5), True)]
 
 
 async def test_an_over_current_of_200_ms_is_published_once_after_it_has_ended(tmp_path: Path) -> None:

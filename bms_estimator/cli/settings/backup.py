@@ -56,7 +56,11 @@ def restore(file: Archive, pack: Pack) -> None:
     """
     # decompressed whole, because tarfile does not check the checksum at the end
     with _user_errors(file), tarfile.open(fileobj=io.BytesIO(gzip.decompress(file.read_bytes()))) as archive:
-        contents = {member.name: _read(archive, member) for member in archive.getmembers() if member.isfile()}
+        contents = {
+            member.name: (archive.extractfile(member) or io.BytesIO()).read()
+            for member in archive.getmembers()
+            if member.isfile()
+        }
     saved = {name.removeprefix(f"{STATE}/"): data for name, data in contents.items() if name.startswith(f"{STATE}/")}
     files = {Path(name).name: data for name, data in contents.items() if name.startswith(f"{SETTINGS}/")}
     if not saved or not files:
@@ -69,19 +73,21 @@ def restore(file: Archive, pack: Pack) -> None:
         raise UserError(
             f"{file}: archive of the pack {archived.pack.name}, but {pack} has pack.name = {settings.pack.name}"
         )
+    for name in saved:
+        if not _state_file_pattern(settings.pack.name).fullmatch(name):
+            raise UserError(f"{file}: {name}: is not a file of the pack {settings.pack.name}")
     with _state_files(pack, settings) as (folder, existing):
         if existing:
             raise UserError(f"{existing[0]}: the pack has a state already; move it away to restore that of {file}")
+        with _user_errors(pack.parent):
+            pack.parent.mkdir(parents=True, exist_ok=True)
+            for name, data in {} if pack.exists() else {**files, pack.name: text.encode()}.items():
+                if not (pack.parent / name).exists():
+                    write_private(pack.parent / name, data)
         with _user_errors(folder):
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             for name, data in saved.items():
-                if not _state_file_pattern(settings.pack.name).fullmatch(name):
-                    raise UserError(f"{file}: {name}: is not a file of the pack {settings.pack.name}")
                 write_private(folder / name, data)
-            if not pack.exists():
-                for name, data in {**files, pack.name: text.encode()}.items():
-                    if not (pack.parent / name).exists():
-                        write_private(pack.parent / name, data)
     typer.echo(f"{folder}: {len(saved)} files of the state of {settings.pack.name} restored; settings: {pack}")
 
 
@@ -106,11 +112,6 @@ def _state_file_pattern(name: str) -> re.Pattern[str]:
     Another pack may be named ``NAME-0123abcd``, like a checkpoint of this pack. Its files have other suffixes.
     """
     return re.compile(rf"{re.escape(name)}(\.[a-z0-9.-]+|-[0-9a-f]{{8}}\.(((history|load)\.)?npz|changes-\d))")
-
-
-def _read(archive: tarfile.TarFile, member: tarfile.TarInfo) -> bytes:
-    content = archive.extractfile(member)
-    return content.read() if content else b""
 
 
 @contextmanager

@@ -33,11 +33,12 @@ def init(file: PackFile = Path("pack.toml")) -> None:
 
 @app.command()
 def check(file: PackFile = Path("pack.toml")) -> None:
-    """Check a settings file and the cell file that it names; report errors and likely mistakes."""
+    """Check a settings file and the cell file that it names; report errors and likely mistakes. It opens no device."""
     settings, cell = load_pack(file)
     for warning in check_settings(settings, cell):
         typer.echo(f"warning: {file}: {warning}", err=True)
     typer.echo(f"{file}: valid; {summarize(settings, cell)}")
+    typer.echo(f"to compare them with the device: bms-estimator doctor {file}")
 
 
 @app.command()

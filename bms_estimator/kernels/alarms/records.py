@@ -131,6 +131,7 @@ SETTINGS = np.dtype(
         ("wire_v", "f8"),
         ("wire_low_cell_v", "f8"),
         ("wire_high_cell_v", "f8"),
+        ("steep_v", "f8"),  # voltage of the highest cell from which the difference between cells is not judged [V]
         ("sensor_suspects", "i8"),  # bits of the input faults that raise ``sensor_fault``
         ("model_suspects", "i8"),  # bits of the input faults that raise ``model_mismatch``
     ],

@@ -86,7 +86,7 @@ def measured_values(
     if math.isnan(current_a) or math.isnan(coldest_c):
         charging_c = math.nan
     out[0], out[1] = math.inf if x.status & _VOLTAGE_SATURATED else voltage_v, voltage_v
-    out[2], out[3], out[4] = high_v, low_v, high_v - low_v
+    out[2], out[3], out[4] = high_v, low_v, high_v - low_v if high_v < p.steep_v else math.nan
     out[5], out[6] = current_a, -current_a
     out[7], out[8], out[9] = hottest_c, coldest_c, charging_c
     out[LINK_LOST] = passed_s if observed_s < passed_s else 0.0  # duration of the gap before the sample; 0: no gap

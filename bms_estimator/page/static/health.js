@@ -7,10 +7,8 @@ const rows = {};
 
 export function drawHealth({ topics: { health: h, info, state } }) {
 	if (!h) return;
-	const faults = [h.sensor_message, ...(h.suspects ?? [])].filter(Boolean);
-	if (changed($("suspects"), faults.join("\n"))) {
-		$("suspects").replaceChildren(...(faults.length ? faults.map((w) => node("li", { class: "bad" }, w)) : [node("li", { class: "good" }, "Nothing is suspected of the input.")]));
-	}
+	const faults = h.suspects ?? []; // a silent sensor is stated above
+	if (changed($("suspects"), faults.join("\n"))) $("suspects").replaceChildren(...faults.map((w) => node("li", { class: "alarm" }, node("b", {}, "Suspected"), node("span", {}, w))));
 	const of = (x, unit) => f.isNumber(x) && `${f.digits(x, 3)} ${unit}`;
 	const e = f.millivolts(state?.tracking_error_v);
 	const tracking = e && `${state.lock ? "in" : "no"} lock, ${state.converged ? "converged" : "converging"}, e ${e}`;

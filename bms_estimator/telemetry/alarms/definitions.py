@@ -17,7 +17,7 @@ from bms_estimator.model.input_faults import InputFault
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.alarm_kinds import Quantity
-from bms_estimator.settings.alarm_limits import AlarmDefinition, min_charge_current_a
+from bms_estimator.settings.alarm_limits import AlarmDefinition, min_charge_current_a, voltage_limits
 from bms_estimator.settings.alarms import AlarmName
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.impossible import PackBounds
@@ -155,6 +155,7 @@ class AlarmDefinitions(NamedTuple):
             "wire_v": limit_of.get("pack_under_voltage", broken_v),
             "wire_low_cell_v": limit_of.get("cell_under_voltage", BROKEN_WIRE_V),
             "wire_high_cell_v": limit_of.get("cell_over_voltage", np.inf),
+            "steep_v": voltage_limits(model).steep_v,
             "sensor_suspects": int(SENSOR_SUSPECTS),
             "model_suspects": int(MODEL_SUSPECTS),
         }

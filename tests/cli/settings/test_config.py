@@ -24,6 +24,7 @@ def test_init_writes_defaults_that_check_accepts(pack, capsys):
     code, out, err = run(capsys, "config", "check", pack)
     assert (code, err) == (0, "")
     assert out.startswith(f"{pack}: valid; pack: ncr18650, 1 in series")
+    assert f"bms-estimator doctor {pack}" in out
     assert load_settings(pack) == Settings()
 
 
@@ -97,7 +98,7 @@ def test_init_does_not_overwrite_a_file(pack, capsys):
         ('[mqtt]\nurl = "http://x"\n', ["mqtt.url = 'http://x'", "mqtt://"]),
         ('[page]\nlisten = "0.0.0.0:8765"\n', ["page: listen", "open to other machines: name a token_file"]),
         ('[page]\nlisten = "8765"\n', ["page.listen = '8765'", "host:port"]),
-        ('[pack]\ncell = ""\n', ["pack.cell = ''", "at least 1 character", "name of a shipped cell"]),
+        ('[pack]\ncell = ""\n', ["pack.cell = ''", "must not be empty", "name of a shipped cell"]),
         ("[pack]\nparallel = 20000\n", ["pack.parallel = 20000", "less than or equal to 10000"]),
         ("[sensor]\nbaud = 20_000_000\n", ["sensor.baud = 20000000", "less than or equal to 10000000"]),
         ("[state]\ncheckpoint_s = 0.1\n", ["state.checkpoint_s = 0.1", "greater than or equal to 1"]),
@@ -207,6 +208,14 @@ def cell_file(tmp_path):
             "series = 2\ncutoff_voltage_v = 6.8",
             "pack.cutoff_voltage_v = 6.8: the OCV of",
         ),
+        ({}, "series = 2\nfull_voltage_v = 84", "pack.full_voltage_v = 84: the OCV of"),
+        ({}, "series = 2\ncutoff_voltage_v = 2.5", "pack.cutoff_voltage_v = 2.5: the OCV of"),
+        (
+            {},
+            "tail_current_a = 150",
+            "pack.tail_current_a = 150: above 3 A, the limit of the alarm charge_over_current",
+        ),
+        ({}, "[alarms]\ncell_imbalance = {limit_v = 50}", "alarms.cell_imbalance.limit_v = 50: outside 0.001 to 1 V"),
         ({}, "series = 2\ncutoff_v = 7.6", "pack.cutoff_v = 7.6: the OCV of"),
         ({}, "series = 2\ncutoff_v = 3.3", "pack.cutoff_v = 3.3: the OCV of"),
         (

@@ -86,7 +86,7 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
         ("Switch off all loads", "", "Switch on a load"),
         ("Switch on a load", "0.1", "switch on a larger load"),
         ("Switch on a load", "5.5", "gain 1.1000"),
-        ("Name of the pack", "my pack", "my pack: must be 1 to 64 of the characters A-Z, a-z, 0-9, _ and -"),
+        ("Name of the pack", "my pack", "my pack: is not of the form that it must have (name of the pack"),
         ("Name of the pack", "house", "lfp  LFP, LiFePO4"),
         ("Chemistry of the cells", "", "an answer is required"),
         ("Chemistry of the cells", "lead", "lead: must be one of"),
