@@ -14,7 +14,7 @@ from bms_estimator.kernels.kalman_filter.input_checks import COUNTERS
 from bms_estimator.kernels.kalman_filter.mixture import scale_state
 from bms_estimator.kernels.kalman_filter.noise import offset_variance
 from bms_estimator.kernels.kalman_filter.records import HYPOTHESES, LN_Q, OFFSET
-from bms_estimator.model.arrays import fields
+from bms_estimator.model.arrays import SAMPLE, fields
 
 MAX_TIME_S = 1e11
 """Maximum plausible time since the history began [s], 3,000 years."""
@@ -120,7 +120,9 @@ def restore_state(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unsee
 
 def _restore(estimator: Estimator, saved: Mapping[str, NDArray[Any]], unseen_s: float) -> str:
     """Restore an estimator as ``restore_state`` does. An invalid state may leave the estimator partly changed."""
-    estimator.step(time_s=0.0, current_a=0.0, voltage_v=estimator.cell.cell.nominal_voltage_v)
+    sample = np.zeros(1, SAMPLE)
+    sample["voltage_v"], sample["temperature_c"] = estimator.cell.cell.nominal_voltage_v, np.nan
+    estimator.run(sample)  # the kernels of a block are compiled before the first sample, those of `step` are not
     after_first_sample = estimator.record.copy()
     filter_was_on = bool(saved.get("filter.started", np.zeros(1))[0])
     # a filter that was off has not initialized its fields

@@ -140,13 +140,13 @@ async def run_estimation_loop(
     fit_thread, status = FitThread(clock, parts.fit_executor), parts.status
     pack = new_pack(settings, model, submit=fit_thread.submit, on_failure=fit_thread.log_failure)
     saved_run = files.read_counters() if files else SavedRun(RunCounters(0, new_totals(clock.wall())))
-    counters = saved_run.counters
+    counters, begin_s = saved_run.counters, since_boot()
     status.hooks, status.fit_times, status.restarts = lambda: hooks.health, lambda: fit_thread.times, counters.restarts
     if files:
         status.checkpoint = files.restore(pack)
     if parts.edge:
         status.edge = parts.edge.health
-    restored_s, totals = since_boot(), LifetimeTotals(pack.estimator, counters.total)
+    totals = LifetimeTotals(pack.estimator, counters.total)
     publisher = Publisher(
         settings,
         pack,
@@ -197,7 +197,7 @@ async def run_estimation_loop(
         stack.enter_context(acknowledge_on_signal(monitor.acknowledge_on_signal))
         notifier.ready(name)
         tasks = [
-            _estimate(source, pack, slots, totals, publisher, parts.edge, restored_s, status),
+            _estimate(source, pack, slots, totals, publisher, parts.edge, begin_s, status),
             _keep_alive(publisher, status, notifier, name, clock),
             _measure_lag(publisher),
         ]
@@ -226,7 +226,7 @@ async def _estimate(
     totals: LifetimeTotals,
     publisher: Publisher,
     edge: BlockSender | None,
-    restored_s: float,
+    begin_s: float,
     status: ServiceStatus,
 ) -> None:
     """Pass each block of samples to the edge, the pack, the totals and the publisher.
@@ -238,10 +238,10 @@ async def _estimate(
         totals: Lifetime totals.
         publisher: Publisher.
         edge: Sender that receives all samples; None: no sender.
-        restored_s: Time since boot at which the state was restored [s].
+        begin_s: Time since boot at which the restoration began, to which the gap of the restored state extends [s].
         status: State of the service, to which the contradictions between settings and device are written.
     """
-    logged_reason, before_s, contradictions = "", restored_s, Contradictions(pack.model)
+    logged_reason, before_s, contradictions = "", begin_s, Contradictions(pack.model)
     async for each in source:
         for voltage_v, current_a in each.samples[-1:][["voltage_v", "current_a"]].tolist():
             if contradictions.add(voltage_v, current_a, each.device_capacity_ah):

@@ -17,11 +17,22 @@ from bms_estimator.service.kernel_compilation import (
 
 FIRST_START = """
 import gc
+import numpy as np
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
+from bms_estimator.model.arrays import SAMPLE, fields
+from bms_estimator.model.cell import load_cell
+from bms_estimator.pack.pack import new_pack
+from bms_estimator.pack.state import PackState
+from bms_estimator.settings.pack import Settings
 from bms_estimator.service.kernel_compilation import argument_types, compile_call, compile_order
 from bms_estimator.service.kernel_warm_up import load_kernels
 load_kernels()
+model, samples = load_cell("chen_mora").pack(4, 1), np.zeros(1, SAMPLE)
+samples["voltage_v"] = model.cell.nominal_voltage_v
+pack, restarted = new_pack(Settings(), model), new_pack(Settings(), model)
+pack.run(samples, np.full((1, 4), samples["voltage_v"] / 4))
+outcomes = restarted.restore(PackState(dict(fields(pack.estimator.record)), cells=pack.cells.saved_state), 60.0)
 gc.unfreeze()
 kernels = [each for each in gc.get_objects() if isinstance(each, Dispatcher) and each.py_func.__module__.startswith("bms_estimator.")]
 loaded = {(f"{each.py_func.__module__}.{each.py_func.__qualname__}", types) for each in kernels for types in each.signatures}
@@ -31,14 +42,14 @@ recorded = {(f"bms_estimator.{name}", eval(types, names)) for name, types in cal
 with event.install_recorder("numba:compile") as compiled:
     for kernel in compile_order():
         compile_call(kernel.call, names)
-print(bool(loaded), loaded - recorded, compiled.buffer)
+print(outcomes["checkpoint"][:8], bool(loaded), loaded - recorded, compiled.buffer)
 """
-"""Program that prints kernels of a first start that the order lacks, and kernels of the order that a first start does not compile."""
+"""Program that prints kernels of a first start and a restart that the order lacks, and kernels of the order that they do not compile."""
 
 
 def test_the_recorded_order_is_that_of_this_version() -> None:
     """If it fails: ``make compile-order``."""
-    assert subprocess.check_output([sys.executable, "-c", FIRST_START], text=True) == "True set() []\n"
+    assert subprocess.check_output([sys.executable, "-c", FIRST_START], text=True) == "restored True set() []\n"
 
 
 @pytest.fixture
