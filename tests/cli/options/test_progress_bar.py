@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.cli.options import capture_options
-from bms_estimator.cli.options.output import ProgressBar, progress_bar
+from bms_estimator.cli.options.progress_bar import ProgressBar, progress_bar
 from tests.command_line import run
 from tests.pseudo_terminal import PseudoTerminal
 
