@@ -15,14 +15,9 @@ from bms_estimator.calibration.elements.initial_elements import (
     scaled_generic_ladder,
 )
 from bms_estimator.calibration.ocv.chen_mora_fit import ChenMoraFit, Points, fit_chen_mora
-from bms_estimator.calibration.ocv.hysteresis import (
-    ExternalCurve,
-    OcvSources,
-    Recording,
-    center_on_typical_hysteresis,
-    has_plateau,
-)
+from bms_estimator.calibration.ocv.hysteresis import center_on_typical_hysteresis, has_plateau
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v
+from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.estimator.settings_records import ocv_grid

@@ -13,7 +13,7 @@ import numpy as np
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, soc_outside
 from bms_estimator.calibration.cleaning.capture_checks import initial_soc as soc_of_first_rest
 from bms_estimator.calibration.cleaning.clean_capture import REST_C_RATE, CleanCapture, are_mismatched, clean_capture
-from bms_estimator.calibration.elements.cell_from_fit import MIN_SOC, SETTLING_S
+from bms_estimator.calibration.elements.replay_score import MIN_SOC, SETTLING_S
 from bms_estimator.calibration.ocv.overpotential import overpotential
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.estimator.settings_records import ocv_grid

@@ -27,8 +27,8 @@ from bms_estimator.mqtt.connection import (
     Message,
     PublishRejection,
     ReceivedMessage,
-    ReceiveQueue,
 )
+from bms_estimator.mqtt.receive_queue import ReceiveQueue
 
 UNSUPPORTED_VERSION = 132
 """CONNACK code of a broker without MQTT 5."""

@@ -1,6 +1,5 @@
 """Interface of a connection to a broker, implemented by ``client``: its messages, and the broker's address, passwords and certificates."""
 
-import asyncio
 import re
 import ssl
 from collections import Counter
@@ -12,11 +11,9 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 from urllib.parse import urlsplit
 
-import aiomqtt
-
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.runtime import credential_path
+from bms_estimator.process.systemd import credential_path
 from bms_estimator.settings.outputs import BrokerSettings
 
 MAX_WAITING = 100
@@ -300,27 +297,3 @@ def _refuse_password(section: str) -> str:
     raise UserError(
         f"{section}.key_file: is encrypted, but a service cannot ask for its password; give a key without a password"
     )
-
-
-class ReceiveQueue(asyncio.Queue[aiomqtt.Message]):
-    """Queue of received messages with limits of their number and size. Lost messages are reported.
-
-    Args:
-        on_lost: Callback with reason and topic of each lost message.
-        max_bytes: Maximum size of a message with its topic [bytes].
-        maxsize: Maximum number of messages.
-    """
-
-    def __init__(self, on_lost: Callable[[str, str], None], max_bytes: int, maxsize: int) -> None:
-        super().__init__(maxsize)
-        self._on_lost, self._max_bytes = on_lost, max_bytes
-
-    def put_nowait(self, item: aiomqtt.Message) -> None:
-        """Append a message, or report its loss."""
-        topic = item.topic.value
-        if len(topic) + len(item.payload) > self._max_bytes:
-            self._on_lost("too_long", topic)
-        elif self.full():
-            self._on_lost("overflow", topic)
-        else:
-            super().put_nowait(item)

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import TemporaryError
-from bms_estimator.process.runtime import credential_path
+from bms_estimator.process.systemd import credential_path
 from bms_estimator.settings.outputs import PageSettings
 
 MIN_TOKEN_CHARACTERS = 16

@@ -22,7 +22,7 @@ from numba import from_dtype, types
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.numba_cache import CACHE_FOLDER, SHIPPED_FOLDER
 from bms_estimator.process.host import anonymous_bytes, available_bytes
-from bms_estimator.process.runtime import extend_start
+from bms_estimator.process.systemd import extend_start
 
 ORDER_FILE = Path(__file__).with_name("compile_order.txt")
 """File with the kernels of a first start, callees before callers. A line has CPU time [s], name and argument types.

@@ -22,8 +22,9 @@ from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model.fit import PackFit
-from bms_estimator.process.runtime import SystemdNotifier, acknowledge_on_signal, until_first_ends
+from bms_estimator.process.runtime import acknowledge_on_signal, until_first_ends
 from bms_estimator.process.stderr_writer import DaemonThreadExecutor, stderr
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.checkpoint_writer import CheckpointWriter
 from bms_estimator.service.publisher import Publisher

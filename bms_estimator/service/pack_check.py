@@ -7,7 +7,7 @@ from bms_estimator.estimator.stability_conditions import observer_warnings
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.mqtt.connection import check as check_brokers
 from bms_estimator.page.access_control import make_access_control
-from bms_estimator.process.runtime import is_unreadable_credential
+from bms_estimator.process.systemd import is_unreadable_credential
 from bms_estimator.service.hook_check import hook_warnings
 from bms_estimator.settings.alarm_limits import implausible_limits
 from bms_estimator.settings.outputs import EdgeSettings, InfluxSettings, MqttSettings, PageSettings

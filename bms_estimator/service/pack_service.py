@@ -22,8 +22,9 @@ from bms_estimator.model.pack_model import PackModel
 from bms_estimator.model.payloads.health import RecordingHealth
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.page.page_sink import Pages, PageSink
-from bms_estimator.process.runtime import SystemdNotifier, set_level, stop_on_signal
+from bms_estimator.process.runtime import set_level, stop_on_signal
 from bms_estimator.process.state_folder import instance_lock, state_folder
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.hook_check import has_relay
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.process.runtime import SystemdNotifier, extend_start
+from bms_estimator.process.systemd import SystemdNotifier, extend_start
 
 
 @pytest.fixture

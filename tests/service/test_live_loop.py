@@ -24,7 +24,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack_model.slow_fit import SlowFit
-from bms_estimator.process.runtime import SystemdNotifier
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.live_loop import LAG_INTERVAL_S, ServiceParts, run_estimation_loop
 from bms_estimator.service.service_status import ServiceStatus

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.process.runtime import SystemdNotifier
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.service import publisher
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.service.pack_service import recording_health

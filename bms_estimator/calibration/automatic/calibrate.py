@@ -20,7 +20,7 @@ from bms_estimator.calibration.automatic.recognition import (
 )
 from bms_estimator.calibration.cleaning.capture_checks import StartOrigin
 from bms_estimator.calibration.elements.initial_elements import ocv_rms_difference_v
-from bms_estimator.calibration.ocv.hysteresis import ExternalCurve
+from bms_estimator.calibration.ocv.source import ExternalCurve
 from bms_estimator.calibration.ocv.table_fit import NODES
 from bms_estimator.calibration.ocv_cell import OcvCell
 from bms_estimator.calibration.validate import Validation, soc_errors, validate

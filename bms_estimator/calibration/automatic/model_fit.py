@@ -11,7 +11,7 @@ from bms_estimator.calibration.cleaning.capture_checks import initial_soc as soc
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.elements.identify import Identification, identify
 from bms_estimator.calibration.elements.ladder_fit import MIN_SPAN_K
-from bms_estimator.calibration.ocv.hysteresis import ExternalCurve, Recording
+from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
 from bms_estimator.calibration.ocv_cell import OcvCell, determine_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import CellModel, with_capacity, with_name

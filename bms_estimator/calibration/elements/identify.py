@@ -24,7 +24,6 @@ from bms_estimator.calibration.elements.cell_from_fit import (
     MIN_RMS_SOC,
     SECTIONS,
     cell_from_fit,
-    interval_score,
     ladder_prior,
     voltage_rms_v,
 )
@@ -39,6 +38,7 @@ from bms_estimator.calibration.elements.ladder_fit import (
     temperature_range,
 )
 from bms_estimator.calibration.elements.normal_equations import NormalEquations, correction_at, normal_equations
+from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.ocv.overpotential import ocv_offset
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.model.arrays import Floats

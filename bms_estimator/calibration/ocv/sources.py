@@ -10,10 +10,6 @@ from bms_estimator.calibration.cleaning.clean_capture import remove_glitches
 from bms_estimator.calibration.ocv.chen_mora_fit import Points, join_points, points_of
 from bms_estimator.calibration.ocv.hysteresis import (
     RESTED_FRACTION_STD,
-    ExternalCurve,
-    OcvSources,
-    Recording,
-    Source,
     center_points,
     find_hysteresis_source,
     has_plateau,
@@ -25,6 +21,7 @@ from bms_estimator.calibration.ocv.overpotential import steady_drop
 from bms_estimator.calibration.ocv.relaxation_test import RelaxationTest, initial_rest_v, relaxation_test
 from bms_estimator.calibration.ocv.slow_branch import SlowBranch, measured_capacity_ah, slow_branches
 from bms_estimator.calibration.ocv.slow_curve import GRID, SlowCurve, slow_curves
+from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording, Source
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.cell import Ladder

@@ -14,8 +14,9 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, initial_soc
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture, clean_capture, remove_glitches
-from bms_estimator.calibration.elements.cell_from_fit import MIN_ERROR_V, interval_score
+from bms_estimator.calibration.elements.cell_from_fit import MIN_ERROR_V
 from bms_estimator.calibration.elements.identify import EQUAL_SCORE_RATIO
+from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.thesis.adaptive_run import AdaptiveRun, adaptive_run
 from bms_estimator.calibration.thesis.prediction import predict
 from bms_estimator.calibration.thesis.series_resistance import (

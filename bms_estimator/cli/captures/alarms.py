@@ -13,6 +13,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.cli.options.capture_input import capture_file, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     CELL_OR_FUEL_CELL_HELP,
@@ -21,12 +22,11 @@ from bms_estimator.cli.options.capture_options import (
     MappedColumns,
     SignOfCurrent,
     SocOfEstimator,
-    capture_file,
     complete_cell,
-    print_guesses,
 )
-from bms_estimator.cli.options.output import compile_ahead, progress_bar, silenced_log
 from bms_estimator.cli.options.pack_options import pack_or_cell, reject_soc_for_fuel_cell, with_pack
+from bms_estimator.cli.options.progress_bar import compile_ahead, progress_bar
+from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.pack_model import PackModel

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.cleaning.data_quality import data_quality
 from bms_estimator.calibration.validate import BLOCK_SAMPLES, Validation, first_time_s, soc_errors, validate
 from bms_estimator.calibration.verdict import is_fitted_to
-from bms_estimator.cli.options.capture_options import read_with_bar
-from bms_estimator.cli.options.output import compile_ahead, progress_bar
+from bms_estimator.cli.options.capture_input import read_with_bar
+from bms_estimator.cli.options.progress_bar import compile_ahead, progress_bar
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.arrays import Floats, SampleBlock, fill_temperature
 from bms_estimator.model.cell import CellModel

@@ -11,16 +11,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses, print_warnings
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     Force,
     MappedColumns,
     SignOfCurrent,
-    capture_file,
     check_output_file,
-    long_file_bar,
-    print_guesses,
-    print_warnings,
 )
 from bms_estimator.model.arrays import SAMPLE, Records, SampleBlock, structured_array
 from bms_estimator.model.charge_count import TimeFaults

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.cli.captures.replay_summary import ReplayResult, Summary
+from bms_estimator.cli.options.capture_input import capture_file, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_HELP,
     CELL_OR_FUEL_CELL_HELP,
@@ -27,12 +28,9 @@ from bms_estimator.cli.options.capture_options import (
     MappedColumns,
     SignOfCurrent,
     SocOfEstimator,
-    capture_file,
     check_output_file,
     complete_cell,
-    print_guesses,
 )
-from bms_estimator.cli.options.output import compile_ahead, progress_bar
 from bms_estimator.cli.options.pack_options import (
     decimal,
     pack_or_cell,
@@ -40,6 +38,7 @@ from bms_estimator.cli.options.pack_options import (
     with_broker,
     with_pack,
 )
+from bms_estimator.cli.options.progress_bar import compile_ahead, progress_bar
 from bms_estimator.model.arrays import Records
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.model.clock import Clock

@@ -13,6 +13,7 @@ from bms_estimator.calibration.verdict import Verdict
 from bms_estimator.checkpoint.arrays_file import RejectedFileError
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.captures.capture_results import capture_result
+from bms_estimator.cli.options.capture_input import capture_files, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
@@ -22,9 +23,7 @@ from bms_estimator.cli.options.capture_options import (
     Series,
     SignOfCurrent,
     TemperatureWithoutSensor,
-    capture_files,
     check_output_file,
-    print_guesses,
     reject_duplicates,
     unique_names,
 )

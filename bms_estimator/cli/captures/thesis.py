@@ -11,6 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
@@ -18,12 +19,11 @@ from bms_estimator.cli.options.capture_options import (
     MappedColumns,
     SignOfCurrent,
     complete_battery,
-    load_captures,
     name_of,
     reject_duplicates,
 )
-from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.cli.options.pack_options import LABORATORY_RESOLUTION_V, decimal
+from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError

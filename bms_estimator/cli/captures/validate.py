@@ -13,6 +13,7 @@ from rich.text import Text
 
 from bms_estimator.calibration.validate import Errors, Validation, soc_errors, validate
 from bms_estimator.calibration.verdict import Run, Verdict, is_fitted_to, judge
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     AsJson,
@@ -24,10 +25,9 @@ from bms_estimator.cli.options.capture_options import (
     SignOfCurrent,
     TemperatureWithoutSensor,
     check_output_file,
-    load_captures,
 )
-from bms_estimator.cli.options.output import compile_ahead, progress_bar
 from bms_estimator.cli.options.pack_options import decimal, pack_or_cell, with_pack
+from bms_estimator.cli.options.progress_bar import compile_ahead, progress_bar
 from bms_estimator.model.arrays import Records, fill_temperature, structured_array
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.sinks.trace_file import table_sink

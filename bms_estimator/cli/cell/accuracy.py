@@ -11,8 +11,9 @@ import typer
 
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.options.capture_options import CELL_HELP, AsJson, CapacityAh, complete_battery
-from bms_estimator.cli.options.output import compile_ahead, print_table
 from bms_estimator.cli.options.pack_options import pack_or_cell
+from bms_estimator.cli.options.progress_bar import compile_ahead
+from bms_estimator.cli.options.table import print_table
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.model.errors import UserError

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.calibration.thesis.adapt import Adaptation, adapt
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     AsJson,
     CapacityAh,
@@ -22,7 +23,6 @@ from bms_estimator.cli.options.capture_options import (
     NewCellFile,
     SignOfCurrent,
     check_output_file,
-    load_captures,
     reject_duplicates,
     write_cell_named_as_file,
 )

@@ -21,8 +21,10 @@ from rich.text import Text
 from bms_estimator.calibration.automatic.calibrate import Calibration, calibrate
 from bms_estimator.calibration.guided_test.plan import LONG, SHORT
 from bms_estimator.cli.cell.calibrate_live import RelayOptions, run_guided_test
-from bms_estimator.cli.cell.calibration_session import given_cell, load_captures_and_curves, open_session, split_inputs
+from bms_estimator.cli.cell.calibration_input import given_cell, load_captures_and_curves, split_inputs
+from bms_estimator.cli.cell.calibration_session import open_session
 from bms_estimator.cli.cell.load_switch import relay_program
+from bms_estimator.cli.options.capture_input import capture_files
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
@@ -32,13 +34,12 @@ from bms_estimator.cli.options.capture_options import (
     Series,
     SignOfCurrent,
     TemperatureWithoutSensor,
-    capture_files,
     check_output_file,
     name_of,
     reject_duplicates,
 )
-from bms_estimator.cli.options.output import progress_bar
 from bms_estimator.cli.options.pack_options import decimal, whole
+from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.arrays import capture_digest, fill_temperature
 from bms_estimator.model.cell import fitted_to
 from bms_estimator.model.config_file import write_text

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.capacity import Capacity, measure_capacity
 from bms_estimator.calibration.capacity_anchors import Anchor
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
@@ -21,7 +22,6 @@ from bms_estimator.cli.options.capture_options import (
     MappedColumns,
     SignOfCurrent,
     complete_battery,
-    load_captures,
 )
 from bms_estimator.cli.options.pack_options import decimal
 from bms_estimator.model.cell import CellModel, load_cell

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from bms_estimator.calibration.elements.identify import CaptureFit, Identification, identify
 from bms_estimator.cli.cell.identify_fuel_cell import identify_fuel_cell
+from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import (
     CELL_OR_FUEL_CELL_HELP,
     AsJson,
@@ -27,11 +28,10 @@ from bms_estimator.cli.options.capture_options import (
     TemperatureWithoutSensor,
     check_output_file,
     complete_cell,
-    load_captures,
     reject_duplicates,
     write_cell_named_as_file,
 )
-from bms_estimator.cli.options.output import progress_bar
+from bms_estimator.cli.options.progress_bar import progress_bar
 from bms_estimator.model.cell import is_fuel_cell, load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.telemetry.state import finite

@@ -13,10 +13,10 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.calibration.ocv.chen_mora_fit import NAMES, ChenMoraFit, max_v, rms_v
-from bms_estimator.calibration.ocv.hysteresis import OcvSources, Recording
+from bms_estimator.calibration.ocv.source import OcvSources, Recording
 from bms_estimator.calibration.ocv.table_fit import TableFit
 from bms_estimator.calibration.ocv_cell import OcvCell, OcvForm, determine_ocv
-from bms_estimator.cli.cell.calibration_session import load_captures_and_curves
+from bms_estimator.cli.cell.calibration_input import load_captures_and_curves
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     AsJson,

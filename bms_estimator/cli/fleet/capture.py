@@ -9,7 +9,7 @@ import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, on_server
 from bms_estimator.cli.options.capture_options import Force, check_output_file
-from bms_estimator.cli.options.output import count_text
+from bms_estimator.cli.options.table import count_text
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.columns import cell_voltage_columns
 from bms_estimator.model.errors import UserError

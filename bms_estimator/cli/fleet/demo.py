@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.output import compile_ahead
 from bms_estimator.cli.options.pack_options import decimal, open_browser, whole
+from bms_estimator.cli.options.progress_bar import compile_ahead
 from bms_estimator.fleet.demo.demo import Demo, run_demo
 from bms_estimator.fleet.demo.processes import free_port
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels

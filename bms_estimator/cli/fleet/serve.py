@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic import TypeAdapter, ValidationError
 
-from bms_estimator.cli.options.output import count_text
+from bms_estimator.cli.options.table import count_text
 from bms_estimator.fleet.packs.csv_table import read_table
 from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.nats_config import CLUSTER_PORT, Accounts

@@ -10,7 +10,7 @@ import structlog
 import typer
 
 from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server
-from bms_estimator.cli.options.output import compile_ahead
+from bms_estimator.cli.options.progress_bar import compile_ahead
 from bms_estimator.fleet.worker.kernel_warm_up import load_fleet_kernels
 from bms_estimator.fleet.worker.worker import CHECKPOINT_S, Options, work
 from bms_estimator.model.errors import UserError

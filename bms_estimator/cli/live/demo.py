@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.output import compile_ahead
 from bms_estimator.cli.options.pack_options import decimal, open_browser, whole
+from bms_estimator.cli.options.progress_bar import compile_ahead
 from bms_estimator.demo.demo import run_demo
 from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.service.kernel_warm_up import load_kernels

@@ -14,7 +14,6 @@ from bms_estimator.cli.options.pack_options import PortOverride, with_sensor
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import (
-    SystemdNotifier,
     configure_logs,
     exit_on_startup_signals,
     flush_logs,
@@ -23,6 +22,7 @@ from bms_estimator.process.runtime import (
     until_first_ends,
 )
 from bms_estimator.process.state_folder import instance_lock, state_folder
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.factory import open_device, pair_with_bms
 from bms_estimator.sources.serial.port_list import KnownBoardFile

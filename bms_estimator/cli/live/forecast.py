@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bms_estimator.checkpoint.state_files import SavedPack, StateFiles
+from bms_estimator.cli.options.capture_input import capture_file, long_file_bar, print_guesses
 from bms_estimator.cli.options.capture_options import (
     CAPTURE_FORMATS,
     CELL_HELP,
@@ -21,14 +22,11 @@ from bms_estimator.cli.options.capture_options import (
     Force,
     MappedColumns,
     SignOfCurrent,
-    capture_file,
     check_output_file,
     complete_battery,
-    long_file_bar,
-    print_guesses,
 )
-from bms_estimator.cli.options.output import compile_ahead
 from bms_estimator.cli.options.pack_options import decimal, pack_or_cell, with_pack
+from bms_estimator.cli.options.progress_bar import compile_ahead
 from bms_estimator.forecast.available_power import Forecast, ForecastCurve
 from bms_estimator.forecast.trip import MAX_LOAD, MAX_TRIP_S, Trip, TripOutcome, constant_trip, trip_outcome
 from bms_estimator.model.cell_slots import CellSlots

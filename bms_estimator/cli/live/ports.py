@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from serial.tools import list_ports
 
-from bms_estimator.cli.options.output import show_status
 from bms_estimator.cli.options.pack_options import complete_port, whole
+from bms_estimator.cli.options.table import show_status
 from bms_estimator.sources.serial.device_detection import probe as probe_port
 from bms_estimator.sources.serial.port_list import holder, stable_names
 

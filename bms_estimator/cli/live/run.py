@@ -12,8 +12,8 @@ from typing import Annotated
 import structlog
 import typer
 
-from bms_estimator.cli.options.output import compile_ahead
 from bms_estimator.cli.options.pack_options import PortOverride, load_pack, with_broker, with_sensor
+from bms_estimator.cli.options.progress_bar import compile_ahead
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.process.runtime import configure_logs, exit_on_startup_signals, flush_logs

@@ -2,7 +2,7 @@
 
 import typer
 
-from bms_estimator.cli.options.output import compile_ahead
+from bms_estimator.cli.options.progress_bar import compile_ahead
 from bms_estimator.model.errors import UserError
 from bms_estimator.numba_cache import CACHE_FOLDER, SHIPPED_FOLDER
 from bms_estimator.service.kernel_compilation import COMPLETE_FILE

@@ -15,8 +15,9 @@ from typing import Annotated
 import typer
 
 from bms_estimator.cli.options.capture_options import AsJson
-from bms_estimator.cli.options.output import progress_bar, silenced_log
 from bms_estimator.cli.options.pack_options import load_pack
+from bms_estimator.cli.options.progress_bar import progress_bar
+from bms_estimator.cli.options.table import silenced_log
 from bms_estimator.doctor.device_check import MIN_FIRST_SAMPLE_TIMEOUT_S, first_sample_timeout_s, load_decoder
 from bms_estimator.doctor.examine import examine
 from bms_estimator.doctor.finding import ExaminedPack, Finding, Level, fault

@@ -7,7 +7,7 @@ from functools import partial
 
 import typer
 
-from bms_estimator.cli.options.output import show_status
+from bms_estimator.cli.options.table import show_status
 from bms_estimator.cli.settings.prompts import Prompts
 from bms_estimator.model.errors import UserError
 from bms_estimator.setup.answers import InvalidAnswerError, parse_number

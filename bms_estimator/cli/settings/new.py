@@ -13,8 +13,9 @@ from typing import Annotated
 
 import typer
 
-from bms_estimator.cli.options.output import compile_ahead, show_status
 from bms_estimator.cli.options.pack_options import decimal
+from bms_estimator.cli.options.progress_bar import compile_ahead
+from bms_estimator.cli.options.table import show_status
 from bms_estimator.cli.settings.multimeter_prompts import MultimeterOptions, compare_with_multimeter
 from bms_estimator.cli.settings.prompts import Prompts
 from bms_estimator.installation.machine import root_command

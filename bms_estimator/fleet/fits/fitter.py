@@ -33,7 +33,8 @@ from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.packs.pack_type import type_estimator
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.process.child_process import request_sigterm_on_exit_of
-from bms_estimator.process.runtime import SystemdNotifier, until_first_ends
+from bms_estimator.process.runtime import until_first_ends
+from bms_estimator.process.systemd import SystemdNotifier
 
 NAME = "fit"
 """Name of the process, for systemd and the server, and of the durable consumer."""

@@ -28,7 +28,8 @@ from bms_estimator.fleet.nats.stream_reader import StoredMessage
 from bms_estimator.fleet.nats.streams import make_telemetry_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.runtime import SystemdNotifier, until_first_ends
+from bms_estimator.process.runtime import until_first_ends
+from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.sources.captures.tables.layout import REQUIRED
 
 _ARROW_STREAM, _ARROW_FILE = b"\xff\xff\xff\xff", b"ARROW1"

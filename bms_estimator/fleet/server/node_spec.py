@@ -7,7 +7,7 @@ from pathlib import Path
 from bms_estimator.fleet.server.disk_space import GB, USABLE_FRACTION, check_disk_space
 from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.runtime import credential_path
+from bms_estimator.process.systemd import credential_path
 from bms_estimator.settings.fleet import FleetSettings, TlsSettings, client_address
 
 MAX_REPLICAS = 3

@@ -27,7 +27,8 @@ from bms_estimator.fleet.worker.lease_tasks import LeaseTasks, PeriodicStorage, 
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.runtime import SystemdNotifier, end, until_first_ends
+from bms_estimator.process.runtime import end, until_first_ends
+from bms_estimator.process.systemd import SystemdNotifier
 
 
 class TenantStores(NamedTuple):

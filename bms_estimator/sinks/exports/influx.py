@@ -24,8 +24,9 @@ import structlog
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
-from bms_estimator.process.runtime import FIRST_DELAY_S, Backoff, credential_path, finish
+from bms_estimator.process.runtime import FIRST_DELAY_S, Backoff, finish
 from bms_estimator.process.stderr_writer import DaemonThreadExecutor
+from bms_estimator.process.systemd import credential_path
 from bms_estimator.settings.outputs import InfluxSettings
 
 STATE = "bms_state"

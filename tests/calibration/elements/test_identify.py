@@ -7,8 +7,9 @@ from scipy.stats import gmean
 from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, initial_soc
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.elements import identify as module
-from bms_estimator.calibration.elements.cell_from_fit import LADDER_STD, cell_file_sections, interval_score
+from bms_estimator.calibration.elements.cell_from_fit import LADDER_STD, cell_file_sections
 from bms_estimator.calibration.elements.identify import identify
+from bms_estimator.calibration.elements.replay_score import interval_score
 from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
 from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator.settings_records import ocv_grid

@@ -10,12 +10,11 @@ from bms_estimator.calibration.ocv.hysteresis import (
     PLATEAU_RESTED_FRACTION,
     RESTED_FRACTION_STD,
     TYPICAL_HYSTERESIS_STD,
-    ExternalCurve,
-    Recording,
     center_on_typical_hysteresis,
 )
 from bms_estimator.calibration.ocv.slow_branch import measured_capacity_ah, slow_branches
 from bms_estimator.calibration.ocv.slow_curve import GRID
+from bms_estimator.calibration.ocv.source import ExternalCurve, Recording
 from bms_estimator.calibration.ocv.sources import find_sources, subtract_rc_overpotential
 from bms_estimator.calibration.ocv.table_fit import NODES, fit_table
 from bms_estimator.calibration.ocv_cell import determine_ocv

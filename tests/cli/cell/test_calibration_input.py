@@ -1,6 +1,6 @@
 """Cell that supplies the values that captures do not determine."""
 
-from bms_estimator.cli.cell.calibration_session import given_cell
+from bms_estimator.cli.cell.calibration_input import given_cell
 
 
 def test_the_capacity_of_the_option_replaces_the_capacity_of_the_pack(tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.options.output import COMPILE_LABEL, COMPILE_TEXT
+from bms_estimator.cli.options.progress_bar import COMPILE_LABEL, COMPILE_TEXT
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 from tests.pseudo_terminal import PseudoTerminal

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.options import capture_options
-from bms_estimator.cli.options.output import ProgressBar, progress_bar
+from bms_estimator.cli.options import capture_input
+from bms_estimator.cli.options.progress_bar import ProgressBar, progress_bar
 from tests.command_line import run
 from tests.pseudo_terminal import PseudoTerminal
 
@@ -56,8 +56,8 @@ def test_a_bar_is_shown_while_a_long_file_is_read(
             yield bar
 
     monkeypatch.chdir(capture.parent)
-    monkeypatch.setattr(capture_options, "LONG_FILE_BYTES", 100)
-    monkeypatch.setattr(capture_options, "progress_bar", recorded_bar)
+    monkeypatch.setattr(capture_input, "LONG_FILE_BYTES", 100)
+    monkeypatch.setattr(capture_input, "progress_bar", recorded_bar)
     assert run(capsys, arguments[0], capture.name, *arguments[1:])[0] == 0
     assert [fraction for _, fraction in labels][-1] == 1.0
     assert labels[0][0].endswith("load.csv")

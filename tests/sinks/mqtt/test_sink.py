@@ -23,10 +23,10 @@ from bms_estimator.mqtt.connection import (
     ConnectOptions,
     DeliveryStats,
     Message,
-    ReceiveQueue,
     brokers,
     check,
 )
+from bms_estimator.mqtt.receive_queue import ReceiveQueue
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import MAX_DELAY_S
 from bms_estimator.settings.outputs import MqttSettings
