@@ -193,7 +193,7 @@ def read_pages(connection: sqlite3.Connection, ranges: Sequence[BlockRange], max
     query = "SELECT number, data FROM block WHERE pack = ? AND number >= ? AND number < ? ORDER BY number LIMIT ?"
     for each in ranges:
         rows = connection.execute(query, (each.pack, each.first, each.end, left)).fetchall()
-        blocks = {number: data for number, data in rows if _is_valid(each.created_s, number, data)}
+        blocks = {number: data for number, data in rows if _is_valid(number, data)}
         damaged = [(each.pack, number) for number, _ in rows if number not in blocks]
         connection.executemany("DELETE FROM block WHERE pack = ? AND number = ?", damaged)
         looked_up = each if len(rows) < left else each._replace(end=rows[-1][0] + 1)
@@ -234,13 +234,12 @@ def _oldest(connection: sqlite3.Connection, pack: str, end: int) -> int:
     return int(oldest)
 
 
-def _is_valid(created_s: int, number: int, data: Any) -> bool:
+def _is_valid(number: int, data: Any) -> bool:
     """Return True if a row holds the undamaged block of its number, by its header and the checksum of its body."""
     if not isinstance(data, bytes):
         return False
     try:
-        header = decode_header(data)
         zlib.decompress(data[HEADER_BYTES:])
+        return decode_header(data).number == number
     except (BlockError, zlib.error):
         return False
-    return header.store_created_ns == created_s * NS_PER_S and header.number == number

@@ -178,26 +178,6 @@ async def test_blocks_lost_by_the_stream_are_sent_again(
     assert receiver.gaps > 0
 
 
-async def test_edge_whose_store_is_full_announces_its_oldest_block(
-    receiver: Receiver, engine: NatsCluster, tmp_path: Path
-) -> None:
-    async with Proxy(engine.mqtt_port) as network:
-        network.rejects_connections = True
-        simulated = SimulatedEdge(receiver, tmp_path, network.url, store_mib=0.1)
-        async with simulated.edge:
-            for _ in range(3):
-                simulated.add(60)
-                await until(lambda: not simulated.edge.store._waiting)
-            dropped = simulated.edge.store.dropped
-            network.rejects_connections = False
-            await receiver.wait_for_samples(180 * 60 - 60 - 60 * dropped)  # the last block is still open
-    await receiver.wait_for_samples(simulated.count - 60 * dropped)
-    assert dropped > 0
-    assert receiver.gaps == 0
-    assert receiver.blocks[0].oldest == receiver.blocks[0].number == dropped + 1
-    assert equal(receiver.samples, np.concatenate(simulated._sent[60 * dropped :]))
-
-
 async def test_invalid_block_requests_are_counted_and_ignored(
     receiver: Receiver, engine: NatsCluster, tmp_path: Path
 ) -> None:

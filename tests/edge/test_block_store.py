@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -51,6 +52,12 @@ async def write_blocks(store: BlockStore, *blocks: ReadyBlock, pack: str = PACK)
     for block in blocks:
         store.put(pack, block)
     assert await store.sync()
+
+
+async def fail_to_sync(store: BlockStore) -> None:
+    """Synchronize while the disk fails."""
+    with mock.patch.object(store._database, "call", side_effect=StoreError("the disk has failed")):
+        assert not await store.sync()
 
 
 async def take(store: BlockStore, count: int, pack: str = PACK) -> list[Block]:
@@ -102,6 +109,7 @@ async def test_restarted_edge_continues_numbers_and_time_of_the_store_and_sends_
         acknowledge(store, 1, 2, 3, 4)
         store.on_request(PACK, BlockRequest(store=int(WALL_S) * NS_PER_S, number=4, resend=False))
         assert (store.waiting, store.unconfirmed) == (2, 3)
+        await fail_to_sync(store)
     async with open_store(tmp_path / "s.sqlite") as store:
         assert store.position(PACK).last_s == WALL_S + 304.0  # five samples from 300 s on
         await write_blocks(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
@@ -161,10 +169,9 @@ async def test_transaction_whose_result_is_unknown_is_repeated_without_effect(tm
             await call(work)
             raise StoreError("the disk has not answered")
 
-        store._database.call = call_without_result
         store.put(PACK, minute_blocks(1)[0])
-        assert not await store.sync()
-        store._database.call = call
+        with mock.patch.object(store._database, "call", call_without_result):
+            assert not await store.sync()
         await write_blocks(store, *minute_blocks(1, first=1))
         assert numbers(await take(store, 2)) == [1, 2]
 
@@ -215,13 +222,19 @@ async def test_request_for_blocks_later_than_those_on_disk_begins_a_new_store(
     async with open_store(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(3))
         await take(store, 3)
-        store.on_request(PACK, block_request)
+        with capture_logs() as lines:
+            for _ in range(2):
+                store.on_request(PACK, block_request)
+        assert sum("a new store is begun" in line["event"] for line in lines) == 1
+        await fail_to_sync(store)
         await write_blocks(store, block_at(WALL_S + 1000.0))
         (block,) = await take(store, 1)
         assert (block.number, block.oldest) == (1, 1)
         assert block.store_created_ns > block_request.store
         assert block.store_created_ns / NS_PER_S + block.samples["time_s"][0] == WALL_S + 1000.0
         assert store.dropped == 3
+    with contextlib.closing(sqlite3.connect(tmp_path / "s.sqlite")) as connection:
+        assert connection.execute("SELECT number FROM block").fetchall() == [(1,)]
 
 
 @pytest.mark.parametrize("store_ns", [0, 5, (1 << 63) - 1])
@@ -279,6 +292,7 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
     async with open_store(path) as store:
         await write_blocks(store, *minute_blocks(3))
         created_s = store.position(PACK).created_s
+        store.on_request(PACK, BlockRequest(store=created_s * NS_PER_S, number=3, resend=False))
     if damage == "no database":
         path.write_bytes(b"not an SQLite file" * 1000)
     elif damage == "deleted":
@@ -292,9 +306,9 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
             await write_blocks(store, block_at(WALL_S + 500.0))
             (block,) = await take(store, 1)
             store.on_request(PACK, BlockRequest(store=block.store_created_ns, number=2, resend=False))
-            await write_blocks(
-                store, block_at(WALL_S + 560.0)
-            )  # whether or not later blocks of the former store remain
+            assert await store.sync()
+            assert store.unconfirmed == 0  # block 3 of the former store may remain on disk
+            await write_blocks(store, block_at(WALL_S + 560.0))
             assert numbers(await take(store, 1)) == [2]
     assert block.store_created_ns > created_s * NS_PER_S
     assert block.number == 1

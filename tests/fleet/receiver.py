@@ -37,7 +37,6 @@ class Receiver:
         blocks: Accepted blocks.
         resends: Number of blocks that arrived again after they had been accepted.
         gaps: Number of blocks that arrived while an earlier one was missing.
-        lost: Number of blocks that the edge no longer has.
     """
 
     def __init__(self, url: str, pack: str) -> None:
@@ -46,7 +45,7 @@ class Receiver:
         self._requested = 0
         self.blocks: list[Block] = []
         self.dropped_once: set[int] = set()
-        self.resends = self.gaps = self.lost = 0
+        self.resends = self.gaps = 0
 
     async def __aenter__(self) -> Self:
         self.nc = await connected(self._url)
@@ -101,9 +100,6 @@ class Receiver:
             return
         if block.store_created_ns > self._store:
             self._store, self._next = block.store_created_ns, block.oldest
-        if block.oldest > self._next:  # the edge has dropped blocks
-            self.lost += block.oldest - self._next
-            self._next = block.oldest
         if block.number < self._next:
             self.resends += 1
         elif block.number > self._next:
