@@ -10,7 +10,6 @@ from bms_estimator.reports.formats import duration_text
 from bms_estimator.reports.history_report import PackHistory, history_report
 from bms_estimator.store.history import Minute
 
-
 text_only = pytest.mark.usefixtures("empty_plots")
 
 

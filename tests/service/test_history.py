@@ -34,7 +34,6 @@ from tests.checkpoint.test_checkpoint import (
 from tests.patience import LONG_S
 from tests.scripted_source import Collector, ScriptedSource
 
-
 pytestmark = pytest.mark.usefixtures("few_draws")
 
 

@@ -351,9 +351,9 @@ def test_without_a_sensor_the_given_temperature_is_used(cold):
 def test_the_initial_soc_can_be_given_and_a_cold_rest_near_full_is_full():
     samples = ladder_capture(steps(duration_s=6000), COLD_C, soc=1.0)
     samples["voltage_v"] -= 0.015  # so that the OCV would give an SOC below 1
-    for given, initial_soc in ((None, 1.0), (0.99, 0.99)):
+    for given, expected in ((None, 1.0), (0.99, 0.99)):
         result = identify([Columns(samples, "cold")], wrong_start(), initial_soc=given, refine_ocv=False)
-        assert result.captures[0].initial_soc == initial_soc
+        assert result.captures[0].initial_soc == expected
 
 
 def with_capacity(capacity_ah):
