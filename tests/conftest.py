@@ -1,6 +1,7 @@
 """Fixtures that every test may use."""
 
 import gc
+import itertools
 import os
 import sys
 from collections.abc import Generator
@@ -46,38 +47,47 @@ sys.dont_write_bytecode = False
 
 LONG_FILES = (
     "tests/home_assistant/test_home_assistant.py",
-    "tests/calibration/elements/test_identify.py",
     "tests/page/test_browser.py",
-    "tests/cli/captures/test_verdicts.py",
-    "tests/cli/settings/test_new.py",
     "tests/service/test_alarm_hooks.py",
-    "tests/calibration/automatic/test_calibrate.py",
-    "tests/cli/cell/test_calibrate.py",
+    "tests/cli/settings/test_new.py",
+    "tests/fleet/worker/test_worker.py",
+    "tests/fleet/server/test_serve.py",
     "tests/service/test_alarm_state.py",
-    "tests/service/test_process.py",
+    "tests/calibration/elements/test_identify.py",
+    "tests/cli/captures/test_verdicts.py",
+    "tests/cli/cell/test_calibrate.py",
+    "tests/calibration/automatic/test_calibrate.py",
     "tests/end_to_end/test_whole_way.py",
-    "tests/telemetry/test_alarms.py",
-    "tests/cli/captures/test_report.py",
-    "tests/cli/live/test_record.py",
+    "tests/estimator/month/test_summary.py",
     "tests/estimator/anywhere/test_anywhere.py",
     "tests/kernels/test_cache_folder.py",
-    "tests/cli/live/test_live_view.py",
+    "tests/service/test_process.py",
+    "tests/service/test_kernel_compilation.py",
+    "tests/deploy/test_wheel.py",
+    "tests/deploy/test_machines.py",
     "tests/fleet/worker/test_partition.py",
-    "tests/pack_model/test_fit.py",
-    "tests/fleet/server/test_serve.py",
+    "tests/fleet/worker/test_pack_fits.py",
+    "tests/fleet/packs/test_erasure.py",
+    "tests/fleet/ingest/test_backfill.py",
+    "tests/fleet/ingest/test_ingest.py",
     "tests/fleet/page/test_browser.py",
     "tests/reports/test_report_in_browser.py",
-    "tests/service/test_pack_model.py",
-    "tests/reports/test_history_report.py",
+    "tests/page/test_setup.py",
+    "tests/test_docs.py",
+    "tests/test_api.py",
+    "tests/library/test_notebook.py",
+    "tests/world/test_world.py",
+    "tests/telemetry/test_alarms.py",
+    "tests/cli/captures/test_report.py",
+    "tests/pack_model/test_fit.py",
     "tests/sinks/mqtt/test_sink.py",
     "tests/cli/captures/test_replay.py",
-    "tests/fleet/ingest/test_ingest.py",
-    "tests/page/test_idle_connections.py",
-    "tests/fleet/worker/test_worker.py",
 )
 """Test files that take longest, by CPU time and waits. They run first, because otherwise one worker could still run one of them
 at the end."""
 
+NUMBERS = itertools.count()
+"""Numbers of the tests' state folders."""
 DATA = Path(__file__).parent / "data"
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -123,9 +133,9 @@ def data() -> Path:
 
 
 @pytest.fixture(autouse=True)
-def state_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Give programs a state folder that belongs to this test, and return it."""
-    folder = tmp_path / "state-home"
+def state_home(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Name a state folder that belongs to this test for programs, and return it. It does not exist yet."""
+    folder = tmp_path_factory.getbasetemp() / f"state-home-{next(NUMBERS)}"
     monkeypatch.setenv("XDG_STATE_HOME", str(folder))
     return folder
 

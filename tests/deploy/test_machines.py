@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.cli.main import main
 from bms_estimator.installation.program_copy import PYTHON, SITE_PACKAGES
 from tests.deploy.core_environment import PROJECT
 from tests.patience import LONG_S
@@ -25,20 +26,25 @@ ROUNDING = 1e-6
 
 
 def replay(folder: Path, python: tuple[str | Path, ...], *options: str, **variables: str) -> str:
-    """Replay a discharge with a rest in each five minutes. Return the table of the estimates."""
+    """Replay a discharge with a rest in each five minutes, in this process without ``python``. Return the table of the estimates."""
     loads = [6.6 if k % 30 < 20 else 0.0 for k in range(300)]
     rows = [f"{10 * k},{load},{3.9 - k / 800 - load / 100:.4f}\n" for k, load in enumerate(loads)]
     (folder / "log.csv").write_text("".join(["time_s,current_a,voltage_v\n", *rows]))
     (folder / "pack.toml").write_text(PACK)
-    command = [*python, *PROGRAM, "replay", "log.csv", "--pack", "pack.toml", "--out", "estimates.csv", "--force"]
-    subprocess.run([*command, *options], cwd=folder, env=os.environ | variables, check=True)
+    paths = folder / "log.csv", "--pack", folder / "pack.toml", "--out", folder / "estimates.csv", "--force"
+    command = ["replay", *map(str, paths), *options]
+    if python:
+        subprocess.run([*python, *PROGRAM, *command], cwd=folder, env=os.environ | variables, check=True)
+    else:
+        with pytest.raises(SystemExit, match="0"):
+            main(command)
     return (folder / "estimates.csv").read_text()
 
 
 def assert_equal(folder: Path, *python: str | Path, **variables: str) -> None:
     """Expect the estimates of this machine to the last bit from another Python, and up to rounding with a fit."""
-    here, there = (sys.executable,), python or (sys.executable,)
-    without_fit, *tables = (replay(folder, here, *options) for options in (["--no-pack-model"], []))
+    there = python or (sys.executable,)
+    without_fit, *tables = (replay(folder, (), *options) for options in (["--no-pack-model"], []))
     assert replay(folder, there, "--no-pack-model", **variables) == without_fit
     tables.append(replay(folder, there, **variables))
     fitted, other = (np.genfromtxt(table.splitlines(), delimiter=",", names=True) for table in tables)

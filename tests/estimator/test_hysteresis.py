@@ -66,7 +66,7 @@ def score_run(block: SampleBlock, soc: np.ndarray, hysteresis_v: float) -> tuple
 
 
 def test_a_configured_hysteresis_improves_soc_and_coverage() -> None:
-    loads = [simulate_cycles(seed) for seed in range(1, 4)]
+    loads = [simulate_cycles(seed) for seed in range(1, 3)]
     rms_error, coverage = np.mean([score_run(*load, HYSTERESIS_V) for load in loads], axis=0)
     rms_error_without, _ = np.mean([score_run(*load, 0.0) for load in loads], axis=0)
     assert rms_error < 0.012

@@ -27,7 +27,8 @@ def pulses() -> tuple[SampleBlock, Floats]:
     count = round(3600 * HOURS * FULL_HZ)
     level_a = OXIDE.capacity_ah * rng.choice([-0.5, 0.0, 0.5, 1.0, 1.5], count)
     samples = np.zeros(count, dtype=SAMPLE)
-    samples["current_a"] = np.repeat(level_a, rng.integers(3 * FULL_HZ, 20 * FULL_HZ, count))[:count]
+    lengths, levels = rng.integers(3 * FULL_HZ, 20 * FULL_HZ, count), count // (3 * FULL_HZ)
+    samples["current_a"] = np.repeat(level_a[:levels], lengths[:levels])[:count]
     samples["time_s"], samples["temperature_c"] = np.arange(count) / FULL_HZ, 15.0
     samples["voltage_v"], soc = simulate(
         1.0 / FULL_HZ,

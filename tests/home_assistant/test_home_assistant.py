@@ -1,4 +1,4 @@
-"""Packs of a real service in a real Home Assistant."""
+"""Pack of a real service in a real Home Assistant."""
 
 import asyncio
 import json
@@ -17,11 +17,10 @@ from bms_estimator.mqtt.connection import Message
 from bms_estimator.settings.outputs import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from bms_estimator.telemetry.publish_window import REST_S
 from bms_estimator.telemetry.state import UNKNOWN_SOC
 from tests.home_assistant.conftest import DASHBOARD
 from tests.home_assistant.instance import ENVIRONMENT, HomeAssistant
-from tests.home_assistant.packs import Packs
+from tests.home_assistant.running_pack import RunningPack
 from tests.mosquitto import Broker, Listener
 from tests.patience import LONG_S
 from tests.sinks.home_assistant.test_discovery import (
@@ -40,8 +39,6 @@ SOC_ENTITY, SET_SOC_ENTITY, SOC_LOW_ENTITY = (
     "number.bms_pack_set_soc",
     "binary_sensor.bms_pack_alarm_soc_low",
 )
-NOT_GRANTED = '"event": "request not granted", "pack": "bench"'
-"""Part of a line of the service's log."""
 UNRELATED_WARNINGS = ("Skipping pip installation", "zlib_ng and isal are not available")
 """Warnings of Home Assistant about its own installation."""
 CARDS = {"conditional", "entities", "entity-filter", "gauge", "history-graph", "statistics-graph", "tile"}
@@ -54,12 +51,12 @@ def number_state(states: dict[str, Any], entity: str) -> float:
     return float(state) if re.fullmatch(r"-?[0-9.]+", state) else float("nan")
 
 
-def first_message(broker: Broker, topic: str, condition: Callable[[Any], bool] = bool) -> Any:
-    """Return the decoded payload of the first message on a topic that fulfils a condition."""
+def first_message(broker: Broker, topic: str) -> Any:
+    """Return the decoded payload of the first message on a topic."""
 
     async def read() -> Any:
         async with Listener(broker, topic) as live:
-            return await live.wait_json(topic, condition)
+            return await live.wait_json(topic)
 
     return asyncio.run(read())
 
@@ -80,7 +77,7 @@ def test_entity_registry_agrees_with_the_discovery_message(home: HomeAssistant, 
     assert registered == {component["default_entity_id"] for component in components.values()}
 
 
-def test_states_equal_the_measured_values(home: HomeAssistant, packs: Packs) -> None:
+def test_states_equal_the_measured_values(home: HomeAssistant) -> None:
     states = home.states()
     # the values that the text board prints; the power is rounded
     measured = {"voltage_v": 13.19, "current_a": 2.0, "power_w": 26.4, "temperature_c": 21.5, "cell_lowest_v": 3.28}
@@ -251,37 +248,6 @@ def count_changes(home: HomeAssistant, device: str) -> int:
     return sum(count - 1 for count in rows_by_entity.values())
 
 
-@pytest.mark.thorough
-def test_button_sets_the_current_zero_once_the_pack_has_rested(
-    home: HomeAssistant, packs: Packs, broker: Broker
-) -> None:
-    first_message(broker, "bms/bench/health", lambda health: health["uptime_s"] > REST_S + 5.0)
-    deadline, granted = time.monotonic() + LONG_S, '"present current taken as zero on request", "pack": "bench"'
-    rejections = -1
-    while granted not in packs.log:
-        assert time.monotonic() < deadline, packs.log[-2000:]
-        if packs.log.count(NOT_GRANTED) > rejections:  # lost frames on a busy machine restart the required rest
-            rejections = packs.log.count(NOT_GRANTED)
-            home.call_service("button.press", entity_id="button.bms_bench_current_zero")
-        time.sleep(1.0)
-
-
-@pytest.mark.thorough
-def test_entities_are_unavailable_from_the_kill_of_the_service_until_its_restart(
-    home: HomeAssistant, packs: Packs
-) -> None:
-    def pack_states(states: dict[str, Any]) -> set[str]:
-        """Return the states of all entities but the one that is unknown until the first forecast."""
-        entities = [entity for entity in states if ".bms_pack_" in entity and not entity.endswith("collapse_risk")]
-        return {states[entity]["state"] for entity in entities}
-
-    packs.kill()
-    home.until(lambda states: pack_states(states) == {"unavailable"})
-    packs.start()
-    states = home.until(lambda states: "unavailable" not in pack_states(states))
-    assert number_state(states, SOC_ENTITY) == pytest.approx(50.0, abs=20.0)
-
-
 def test_collapse_risk_is_unknown_until_its_first_value(home: HomeAssistant, broker: Broker) -> None:
     cleared = cleared_alarm("collapse_risk")
     without_value = cleared.model_copy(update={"unknown_reason": "no value yet"})
@@ -298,10 +264,10 @@ def test_collapse_risk_is_unknown_until_its_first_value(home: HomeAssistant, bro
     home.until(lambda states: states[entity]["state"] == "off")
 
 
-def test_silent_board_makes_alarms_unavailable_and_not_off(home: HomeAssistant, packs: Packs) -> None:
-    packs.silent.set()
+def test_silent_board_makes_alarms_unavailable_and_not_off(home: HomeAssistant, pack: RunningPack) -> None:
+    pack.silent.set()
     home.until(lambda states: {states[SOC_ENTITY]["state"], states[SOC_LOW_ENTITY]["state"]} == {"unavailable"})
-    packs.silent.clear()
+    pack.silent.clear()
     states = home.until(
         lambda states: "unavailable" not in (states[SOC_ENTITY]["state"], states[SOC_LOW_ENTITY]["state"])
     )

@@ -152,7 +152,7 @@ def cached_kernel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_another_installation_of_the_same_version_loads_shipped_and_cached_kernels(
     cached_kernel: Path, tmp_path: Path, shipped: bool
 ) -> None:
-    shutil.copytree(PACKAGE, tmp_path / "bms_estimator", ignore=shutil.ignore_patterns("__pycache__", "compiled"))
+    shutil.copytree(PACKAGE, tmp_path / "bms_estimator", ignore=shutil.ignore_patterns("compiled"))
     cache = cached_kernel
     if shipped:
         shutil.copytree(cached_kernel, tmp_path / "bms_estimator" / "compiled")

@@ -128,7 +128,10 @@ def board(_time_s: float) -> dict[str, Any]:
 async def programs(folder: Path, broker: Broker) -> AsyncIterator[RunningPrograms]:
     await record_history(folder / "cellar.sqlite", [])
     port = free_port()
-    async with Service(folder, broker, free_port(), board, pack=PACK_SECTION) as service, Listener(broker) as live:
+    async with (
+        Service(folder, broker, free_port(), board, pack=PACK_SECTION, rate_hz=2.0) as service,
+        Listener(broker) as live,
+    ):
         arguments = ("--mqtt", broker.url, "--listen", f"127.0.0.1:{port}", "--folder", folder, "--no-browser")
         process = await start_program(folder, "dashboard", *arguments, port=port)
         await publish(live, "availability", b"online")

@@ -32,6 +32,7 @@ def assert_undisturbed(outcome: Outcome) -> None:
     assert outcome.log_lines < MAX_LOG_LINES
 
 
+@pytest.mark.thorough
 async def test_service_with_idle_connections_saves_checkpoints_and_reconnects_to_its_broker(
     tmp_path: Path, broker: Broker
 ) -> None:

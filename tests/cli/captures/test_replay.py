@@ -22,6 +22,8 @@ from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWri
 from bms_estimator.telemetry.state import NOT_IDENTIFIED
 from tests.command_line import run
 
+pytestmark = pytest.mark.usefixtures("few_draws")
+
 SUMMARY_KEYS = {  # some of the keys
     "samples",
     "duration_s",

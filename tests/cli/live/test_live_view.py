@@ -37,19 +37,19 @@ def test_main_values_are_shown_on_any_screen_size(demo: PseudoTerminal, columns:
     demo.until(lambda: shows_soc(demo))
 
 
-def test_interrupted_demo_prints_a_summary_and_restores_the_terminal() -> None:
-    with PseudoTerminal("demo", "--port", str(free_port())) as terminal:
-        terminal.until(lambda: shows_soc(terminal))
-        terminal.process.send_signal(signal.SIGINT)
-        terminal.until(terminal.ended)
-        terminal.until(lambda: "lock\r\n" in terminal.output)
-        assert terminal.process.returncode == 0
-        assert terminal.is_as_before()
-    after_view = terminal.output.split(ALTERNATE)[-1]
+def test_interrupted_demo_prints_a_summary_and_restores_the_terminal(demo: PseudoTerminal) -> None:
+    """This test ends the demo that the tests before it share."""
+    demo.until(lambda: shows_soc(demo))
+    demo.process.send_signal(signal.SIGINT)
+    demo.until(demo.ended)
+    demo.until(lambda: "lock\r\n" in demo.output)
+    assert demo.process.returncode == 0
+    assert demo.is_as_before()
+    after_view = demo.output.split(ALTERNATE)[-1]
     assert BACK in after_view
     assert CURSOR in after_view
     assert re.search(r"SOC error -20\.00% at the start, ", after_view.replace("\r\n", " "))
-    assert "Traceback" not in terminal.output
+    assert "Traceback" not in demo.output
 
 
 @pytest.mark.thorough

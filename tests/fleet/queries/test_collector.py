@@ -103,6 +103,7 @@ async def test_rows_in_memory_are_written_at_shutdown_and_invalid_rows_are_count
     assert len(rows_of(tmp_path)) == 1
 
 
+@pytest.mark.thorough
 async def test_unacknowledged_rows_of_a_killed_collector_are_redelivered(cluster, nc, tmp_path):
     """Kill the command while it has waiting and written rows, and continue with another collector."""
     rows = [make_hour(f"p{n}", MIDNIGHT + hour) for hour in range(4) for n in range(500)]

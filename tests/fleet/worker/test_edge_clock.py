@@ -234,7 +234,7 @@ async def test_worker_names_a_pack_in_2040_in_its_heartbeat_and_quarantines_its_
 
 @pytest.mark.thorough
 async def test_edge_whose_clock_steps_back_by_days_loses_no_sample_and_is_not_silent(
-    nc, cluster, heartbeats, tmp_path, line
+    nc, cluster, heartbeats, tmp_path, state_home, line
 ):
     """The clock is 5 days behind, then correct, then 3 days behind, also after restarts: with the store and without it."""
     line.plug()
@@ -245,7 +245,7 @@ async def test_edge_whose_clock_steps_back_by_days_loses_no_sample_and_is_not_si
     try:
         await edge.run(heartbeats, nc, -5 * DAY_S, 0, -3 * DAY_S)
         await edge.run(heartbeats, nc, -3 * DAY_S)
-        for file in (tmp_path / "state-home").rglob("pack.edge.sqlite*"):
+        for file in state_home.rglob("pack.edge.sqlite*"):
             file.unlink()
         blocks = await edge.run(heartbeats, nc, -3 * DAY_S)
         heartbeat = heartbeats.last["w1"]

@@ -95,7 +95,7 @@ def record_of(stream: Stream) -> np.ndarray:
 
 def test_worker_that_is_killed_after_each_message_agrees_with_a_replay_bit_for_bit(samples) -> None:
     stream, pack = FittedStream(), new_pack(SETTINGS, CELL, has_forecasts=False)
-    stream.send_all(blocks_of(samples, size=BLOCK_SAMPLES), take_over=True)
+    stream.send_all(blocks_of(samples, size=2 * BLOCK_SAMPLES), take_over=True)
     pack.run(samples)
     assert pack.slow_fit.fits >= 2
     assert stream.partition.counters["fits"] == pack.slow_fit.fits

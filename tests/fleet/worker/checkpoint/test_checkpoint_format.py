@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from bms_estimator.fleet.packs.table_change import PackSource
@@ -92,7 +92,6 @@ def test_checkpoint_of_many_packs_is_split_into_chunks() -> None:
 
 
 @given(snapshots, st.data())
-@settings(max_examples=200)
 def test_damaged_checkpoint_raises_checkpoint_error(snapshot: PartitionCheckpoint, data) -> None:
     intact = to_bytes(snapshot)
     damaged = bytearray(intact)
