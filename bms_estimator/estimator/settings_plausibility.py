@@ -110,7 +110,7 @@ def implausible_measurement(cell: PackModel, voltage_v: float, current_a: float,
 class Contradictions:
     """Settings that the first values of a device contradict, until its values at rest agree with them.
 
-    Later values are not compared as long as the first agree, because a pack that was just charged or is empty has such a voltage.
+    If the first values agree, later ones are not compared, because a pack that was just charged or is empty has another voltage.
 
     Args:
         cell: Model of the whole pack.
@@ -120,8 +120,7 @@ class Contradictions:
     """
 
     def __init__(self, cell: PackModel) -> None:
-        self._cell, self._device_ah, self._is_compared = cell, math.nan, False
-        self.texts = list[str]()
+        self._cell, self._device_ah, self._is_compared, self.texts = cell, math.nan, False, list[str]()
 
     def add(self, voltage_v: float, current_a: float, device_ah: float) -> bool:
         """Compare the values of a sample. Return True for those of the first sample, and the first capacity of the device.
@@ -136,8 +135,9 @@ class Contradictions:
         self._device_ah = self._device_ah if math.isnan(device_ah) else device_ah
         if is_first or (self.texts and abs(current_a) <= MAX_RESTING_C * self._cell.one_c_a):
             lines = implausible_measurement(self._cell, voltage_v, current_a, self._device_ah)
-            lasts = [text for text in self.texts if any(line.split()[0] == text.split()[0] for line in lines)]
-            self.texts, self._is_compared = lines if is_first else lasts, True
+            settings = [line.split()[0] for line in lines]
+            self.texts = [text for text in self.texts if (text.split()[0] in settings) != is_first] + lines * is_first
+            self._is_compared = True
         return is_first
 
 

@@ -36,6 +36,7 @@ class SensorSettings(Strict):
 
     port: str = Field(
         default="auto",
+        min_length=1,
         description="path of the serial port, preferably below /dev/serial/by-id; auto: port of the only connected board",
     )
     serial: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")] | None = Field(

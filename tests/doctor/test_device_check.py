@@ -5,6 +5,7 @@ import os
 import re
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,9 @@ import pytest
 from bms_estimator.doctor import device_check
 from bms_estimator.doctor.device_check import check_board, check_device, first_sample_timeout_s
 from bms_estimator.doctor.finding import Level
-from bms_estimator.process.state_folder import instance_lock
-from bms_estimator.simulation.simulated_pack import SimulatedBms
+from bms_estimator.model.cell import load_cell
+from bms_estimator.process.instance_lock import instance_lock
+from bms_estimator.simulation.simulated_bms import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.port_list import KnownBoardFile
@@ -42,11 +44,18 @@ def board_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
         loop.close()
 
 
-def test_a_board_that_answers_is_reported_with_its_values(tmp_path: Path, board_port: str) -> None:
-    device, board = check_device(subject(tmp_path, sensor={"port": board_port}))
+@pytest.mark.parametrize(
+    ("capacity_ah", "doubt"), [(20.0, ""), (5.0, "; without cell voltages, 5 in series cannot be excluded")]
+)
+def test_a_board_that_answers_is_reported_with_its_values(
+    tmp_path: Path, board_port: str, capacity_ah: float, doubt: str
+) -> None:
+    """The voltage at rest shows the number of cells; 0.5 A are a load for 5 Ah."""
+    pack = replace(subject(tmp_path, sensor={"port": board_port}), model=load_cell("lfp", capacity_ah).pack(4, 1))
+    device, board = check_device(pack)
     assert device.level is Level.OK
     assert re.fullmatch(
-        rf"{board_port}: 13\.[12]\d+ V, 0\.\d+ A; firmware 0\.2\.0, serial 0000002a; without cell voltages, 5 in series cannot be excluded",
+        rf"{board_port}: 13\.[12]\d+ V, 0\.\d+ A; firmware 0\.2\.0, serial 0000002a{doubt}",
         device.text,
     )
     assert (board.check, board.level) == ("board", Level.WARNING)

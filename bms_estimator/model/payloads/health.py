@@ -175,7 +175,9 @@ class Health(Payload):
     line: dict[str, int] = Field(description="frames and faults of the source by kind, since start")
     samples: dict[str, int] = Field(description="accepted and dropped samples by kind, since start")
     identifier: dict[str, int] = Field(description="samples skipped by the identifier, and its resets, since start")
-    suspects: list[str] = Field(description="input diagnostics with remedies; empty: none")
+    suspects: list[str] = Field(
+        description="input diagnostics, and settings that the device contradicts, with remedies; empty: none"
+    )
     anchor: AnchorReport | None = Field(
         default=None, description="the last end of a charge or discharge; null: none since the first start"
     )

@@ -99,6 +99,7 @@ def test_init_does_not_overwrite_a_file(pack, capsys):
         ('[page]\nlisten = "0.0.0.0:8765"\n', ["page: listen", "open to other machines: name a token_file"]),
         ('[page]\nlisten = "8765"\n', ["page.listen = '8765'", "host:port"]),
         ('[pack]\ncell = ""\n', ["pack.cell = ''", "must not be empty", "name of a shipped cell"]),
+        ('[sensor]\nport = ""\n', ["sensor.port = ''", "must not be empty", "path of the serial port"]),
         ("[pack]\nparallel = 20000\n", ["pack.parallel = 20000", "less than or equal to 10000"]),
         ("[sensor]\nbaud = 20_000_000\n", ["sensor.baud = 20000000", "less than or equal to 10000000"]),
         ("[state]\ncheckpoint_s = 0.1\n", ["state.checkpoint_s = 0.1", "greater than or equal to 1"]),

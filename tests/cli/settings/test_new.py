@@ -226,35 +226,33 @@ def test_a_named_port_without_a_device_is_reported_with_its_option(file, capsys,
     assert err.startswith(f"error: --device {tmp_path / 'none'}: cannot be opened")
 
 
-def test_a_multimeter_corrects_gain_and_sign_of_a_bms(file, capsys, long_timeouts):
-    with running_device(jk_bms(current_a=-5.0)) as path:
-        meter = ["--voltmeter-v", "26.664", "--ammeter-a", "5.5"]
+@pytest.mark.parametrize(
+    ("current_a", "meter", "outputs", "expected"),
+    [
+        (
+            -5.0,
+            ["--voltmeter-v", "26.664", "--ammeter-a", "5.5"],
+            ["voltage: device 26.400 V, multimeter 26.664 V: gain 1.0100", "the sign of the current is reversed"],
+            {"voltage_gain": 1.01, "current_gain": 1.1, "current_sign": "discharge_positive"},
+        ),
+        (
+            -5.0,
+            ["--direction", "discharging"],
+            ["current: the sign is reversed"],
+            {"current_sign": "discharge_positive", "current_gain": 1.0},
+        ),
+        (0.3, ["--zero"], [], {"current_zero_a": -0.3}),
+    ],
+)
+def test_a_multimeter_corrects_gain_sign_and_zero_of_a_bms(
+    file, capsys, long_timeouts, current_a, meter, outputs, expected
+):
+    """A JK-BMS reports charge as positive, and the zero has its sign."""
+    with running_device(jk_bms(current_a=current_a)) as path:
         code, out, err = run(capsys, "new", file, "--device", path, *options(), *meter, "--yes", "--no-estimate")
-    assert (code, err) == (0, "")
-    assert "voltage: device 26.400 V, multimeter 26.664 V: gain 1.0100" in out
-    assert "the sign of the current is reversed" in out
+    assert (code, err, [text for text in outputs if text not in out]) == (0, "", [])
     sensor = load_settings(file).sensor
-    assert (sensor.voltage_gain, sensor.current_gain) == (pytest.approx(1.01), pytest.approx(1.1))
-    assert sensor.current_sign == "discharge_positive"  # a JK-BMS reports charge as positive
-
-
-def test_the_direction_of_a_load_corrects_the_sign_alone(file, capsys, long_timeouts):
-    with running_device(jk_bms(current_a=-5.0)) as path:
-        arguments = [*options(), "--direction", "discharging", "--yes", "--no-estimate"]
-        code, out, err = run(capsys, "new", file, "--device", path, *arguments)
-    assert (code, err) == (0, "")
-    assert "current: the sign is reversed" in out
-    assert tomllib.loads(file.read_text())["sensor"]["current_sign"] == "discharge_positive"
-    assert load_settings(file).sensor.current_gain == 1.0
-
-
-def test_the_zero_of_a_bms_is_written_with_its_sign(file, capsys, long_timeouts):
-    with running_device(jk_bms(current_a=0.3)) as path:
-        code, _, err = run(capsys, "new", file, "--device", path, *options(), "--zero", "--yes", "--no-estimate")
-    assert (code, err) == (0, "")
-    assert load_settings(file).sensor.current_zero_a == pytest.approx(
-        -0.3
-    )  # in the sign of a JK-BMS, which reports charge as positive
+    assert {name: getattr(sensor, name) for name in expected} == pytest.approx(expected)
 
 
 @pytest.mark.usefixtures("firmware")
