@@ -1,5 +1,7 @@
 """Deaths of holders in a guarded replay, counted on the real server."""
 
+import asyncio
+
 import pytest
 from nats.aio.client import Client
 
@@ -7,6 +9,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
+from bms_estimator.process.tasks import end
 from tests.fleet.checkpoints import raw
 
 END_SEQUENCE = 9
@@ -54,6 +57,15 @@ async def test_guarded_replay_does_not_wait_for_the_leader_of_the_bucket(nc: Cli
     guard = await claim_guarded(store)
     await nc.jetstream().delete_stream(f"KV_{subjects.CHECKPOINTS_BUCKET}")
     assert not await guard.begin_block(5)
+
+
+async def test_worker_that_is_stopped_in_a_guarded_replay_can_write_its_checkpoint(store: CheckpointStore) -> None:
+    guard = await claim_guarded(store)
+    beginning = asyncio.create_task(guard.begin_block(5))
+    for _ in range(3):  # until it waits for the receipt
+        await asyncio.sleep(0)
+    await end(beginning)
+    await store.claims.read(0)  # not possible if the connection is no longer read
 
 
 @pytest.mark.parametrize("is_saved", [True, False], ids=["after a checkpoint", "after an orderly release"])

@@ -43,14 +43,14 @@ class CheckpointObjects:
 
         Args:
             name: Name of the object (``object_name``). Chunks of an earlier attempt are removed.
-            chunks: Bytes of the object, in parts that are not empty; iterated in a thread.
+            chunks: Bytes of the object; iterated in a thread.
 
         Raises:
             nats.js.errors.APIError: The server rejects the object.
         """
         subject, digest, size, count = _chunk_subject(name), hashlib.sha256(), 0, 0
         await self._js.purge_stream(_STREAM, subject=subject)
-        while chunk := await asyncio.to_thread(next, chunks, None):
+        while (chunk := await asyncio.to_thread(next, chunks, None)) is not None:
             digest.update(chunk)
             for first in range(0, len(chunk), MESSAGE_BYTES):
                 await self._js.publish(subject, chunk[first : first + MESSAGE_BYTES])

@@ -64,7 +64,8 @@ class ReplayRecords:
         """
         await self.send(partition, record)
         await asyncio.sleep(0)  # lets a task of nats-py write the record before the flush writes a ping
-        await self._nc.flush(RECEIPT_TIMEOUT_S)
+        # nats-py stops reading from the connection when the response to a cancelled flush arrives
+        await asyncio.shield(self._nc.flush(RECEIPT_TIMEOUT_S))
 
     async def send(self, partition: int, record: ReplayRecord) -> None:
         """Send the record of a guarded replay."""

@@ -249,12 +249,12 @@ async def test_worker_waits_for_streams_and_table_rows_and_continues_from_the_ne
                 worker_task = asyncio.create_task(work(Options(cluster.url, "w"), stop))
                 await send(nc, "p1", block("p1", number))
                 await _until_block(states, number)
+                await _until_block(late_states, 1)  # although no block arrived after the pack became known
                 stop.set()
                 await worker_task
             # a damaged checkpoint may be logged again when the worker is fenced and starts again
             assert len({line["object"] for line in logs if "is damaged" in line["event"]}) == damaged_count
             assert any("from its beginning" in line["event"] for line in logs) == (damaged_count == 2)
-        await _until_block(late_states, 1)  # although no block arrived after the pack became known
         state = (await end_states(nc, registry, 1))[0].state("p1")
         assert state is not None
         assert estimates_of(state["estimator"]) == estimated(registry, "p1", number)
