@@ -28,7 +28,7 @@ class FittedState:
     """Results of a fit in the units of the filter.
 
     Attributes:
-        soc: SOC at the present sample; None: unknown, because a gap followed the fit. The SOC of each hypothesis then remains.
+        soc: SOC at the present sample; None: the SOC of each hypothesis remains, because a gap followed the fit or the filter is surer.
         ln_q: Logarithm of the ratio of the capacity to the declared one.
         offset_a: Current offset [A].
         covariance: Covariance of ``FILTER_STATES``. The correction of the OCV is 0, because the settings have the fitted curves.

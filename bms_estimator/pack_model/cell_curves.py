@@ -28,10 +28,6 @@ differs between charge, rest and discharge."""
 DIRECTION_STD_RANGE_V = 2e-3, 6e-3
 """Limits of the std of the direction-dependent error [V]. The lower one is assumed for cells whose file was fitted to their own
 captures, and the upper one for generic cells."""
-OVERPOTENTIAL_STD_FRACTION = 0.25
-"""Relative std of the difference of the overpotential between charge and discharge, as a fraction of the std of ln R."""
-OVERPOTENTIAL_STD_RANGE = 0.04, 0.08
-"""Limits of this relative std of the overpotential."""
 
 
 class CellCurves:
@@ -64,8 +60,6 @@ class CellCurves:
             np.clip(DIRECTION_STD_FRACTION * np.median(self.ocv_std_v), *DIRECTION_STD_RANGE_V)
         )
         """Std of the direction-dependent error [V]."""
-        self.drop_std = float(np.clip(OVERPOTENTIAL_STD_FRACTION * self.r_std, *OVERPOTENTIAL_STD_RANGE))
-        """Relative std of the difference of the overpotential between charge and discharge at one SOC."""
         self.charge_error = float(settings["charge_error"])
         """Std of the SOC counted over a charge throughput of 1."""
         self.aged_soc = float(settings["aged_soc"])

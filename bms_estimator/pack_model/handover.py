@@ -1,7 +1,7 @@
 """Transfer of a fit's results to the filter.
 
 The fitted curves replace those in the filter's settings. SOC, capacity and offset of the fit, with their covariance, replace
-those in the filter's state.
+those in the filter's state. The SOC of a filter that is surer than the fit remains.
 """
 
 import math
@@ -113,13 +113,15 @@ def r_std(fit: PackFit) -> float:
 def adopt_state(estimator: Estimator, fit: PackFit) -> None:
     """Set SOC, offset and capacity of the filter, with their covariances with the curve, after ``adopt_curves``.
 
-    After a gap since the fit's last row each hypothesis of the filter keeps its SOC.
+    After a gap since the fit's last row each hypothesis of the filter keeps its SOC. A single hypothesis also keeps it if its std is
+    smaller than the fit's.
     """
-    h, p = estimator.record[0]["history"], estimator.settings_record[0]["filter"]
+    h, f, p = estimator.record[0]["history"], estimator.record[0]["filter"], estimator.settings_record[0]["filter"]
+    is_surer = f["count"] == 1 and f["soc_std"] ** 2 < fit.covariance[FIT_SOC, FIT_SOC]
     drawn_soc = (h["charge_as"] - fit.charge_as) / p["capacity_as"] * math.exp(-fit.mean[FIT_LN_Q])
     estimator.adopt(
         FittedState(
-            soc=fit.mean[FIT_SOC] - drawn_soc if h["segment"] == fit.segment else None,
+            soc=fit.mean[FIT_SOC] - drawn_soc if h["segment"] == fit.segment and not is_surer else None,
             ln_q=fit.mean[FIT_LN_Q],
             offset_a=fit.mean[FIT_OFFSET] * p["capacity_as"] / HOUR_S,
             covariance=_state_covariance(fit, p),

@@ -31,9 +31,12 @@ from bms_estimator.pack_model.intervals import Intervals
 from bms_estimator.pack_model.prior import variance_between_nodes
 from bms_estimator.pack_model.unknowns import SCALES, Unknowns
 
+OVERPOTENTIAL_STD = 0.08
+"""Relative std of the difference of the overpotential between charge and discharge at one SOC. A cell file that was identified
+from pulses has this error in drives, too."""
 PASS_FRACTION = 0.75
 """Std of the part of the overpotential's error that differs from pass to pass, as a fraction of the std of the part that
-repeats (``CellCurves.drop_std``)."""
+repeats (``OVERPOTENTIAL_STD``)."""
 COUNT_STD_SOC = 0.004
 """Std of the SOC of a row due to counting [SOC]."""
 KNEE_STD_SOC, KNEE_WIDTH_SOC = 0.008, 0.12
@@ -115,7 +118,7 @@ class VoltageModel:
         terms["start_load_a"] = START_LOAD_C * cell.one_c_a * remaining_fraction(rows)
         terms["aging_trend"] = AgingVariance(RESISTANCE, cell, intervals).trend[intervals.of_row]
         terms["direction_v"] = np.sqrt(
-            cell.direction_std_v**2 + (cell.drop_std * drop_v) ** 2 + variance_between_nodes(cell, z)
+            cell.direction_std_v**2 + (OVERPOTENTIAL_STD * drop_v) ** 2 + variance_between_nodes(cell, z)
         )
         self.rows = terms
         """Quantities of each row, dtype MODEL_ROW."""
@@ -127,7 +130,7 @@ class VoltageModel:
     def _variance(self, z: Floats, drop_v: Floats) -> Floats:
         """Return the variance of each row's voltage about its prediction [V^2]."""
         near_empty, cell = np.exp(-((z / KNEE_WIDTH_SOC) ** 2)), self.cell
-        pass_error_v2 = cell.direction_std_v**2 + (PASS_FRACTION * cell.drop_std * drop_v) ** 2
+        pass_error_v2 = cell.direction_std_v**2 + (PASS_FRACTION * OVERPOTENTIAL_STD * drop_v) ** 2
         soc_error_v2 = (cell.slope(z) * (COUNT_STD_SOC + KNEE_STD_SOC * near_empty)) ** 2
         return np.asarray(pass_error_v2 + soc_error_v2)
 

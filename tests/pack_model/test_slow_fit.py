@@ -107,25 +107,29 @@ def test_fit_that_fails_leaves_the_previous_one_in_use(samples: SampleBlock, mon
     assert np.isfinite(trace["soc"]).all()
 
 
-def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_adopted_state_is_that_of_the_fit_but_for_the_soc_of_a_surer_filter(
+    samples: SampleBlock, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The charge since the fit's last row is subtracted. Covariances with the curve are in the filter's units."""
     slow_fit = new_slow_fit()
     adopted: list[tuple[np.ndarray, np.ndarray, float, float]] = []
     adopt_state = slow_fit_module.adopt_state
 
     def adopt_and_copy(estimator: Estimator, fitted: PackFit) -> None:
-        adopt_state(estimator, fitted)
         f, h = estimator.record[0]["filter"], estimator.record[0]["history"]
+        f["soc_std"] = 1.0
+        adopt_state(estimator, fitted)
         adopted.append((f["mean"][0].copy(), f["covariance"][0].copy(), float(h["charge_as"]), float(f["soc"])))
 
     monkeypatch.setattr(slow_fit_module, "adopt_state", adopt_and_copy)
     run(slow_fit, samples)
     mean, covariance, charge_as, soc = adopted[-1]
-    fitted, p = slow_fit.fit, slow_fit.estimator.settings_record[0]["filter"]
+    fitted, p, f = slow_fit.fit, slow_fit.estimator.settings_record[0]["filter"], slow_fit.estimator.record[0]["filter"]
     assert fitted is not None
     assert slow_fit.fits == len(adopted)
-    drawn_soc = (charge_as - fitted.charge_as) / p["capacity_as"] * np.exp(-fitted.mean[fit_module.LN_Q])
-    assert mean[SOC] == pytest.approx(fitted.mean[fit_module.SOC] - drawn_soc, abs=1e-12)
+    assert fitted.mean[fit_module.SOC] - mean[SOC] == pytest.approx(
+        (charge_as - fitted.charge_as) / p["capacity_as"] * np.exp(-fitted.mean[fit_module.LN_Q]), abs=1e-12
+    )
     assert soc == pytest.approx(min(mean[SOC], 1.0), abs=1e-9)
     assert mean[LN_Q] == fitted.mean[fit_module.LN_Q]
     one_c_a = float(p["capacity_as"]) / 3600.0
@@ -134,8 +138,12 @@ def test_adopted_state_is_that_of_the_fit(samples: SampleBlock, monkeypatch: pyt
     assert covariance[LN_Q, OFFSET] == pytest.approx(fitted.covariance[fit_module.LN_Q, fit_module.OFFSET] * one_c_a)
     assert covariance[LN_R0, LN_R0] == covariance[LN_R, LN_R] == p["r_std"] ** 2
     np.testing.assert_array_equal(covariance, covariance.T)
-    block = covariance[np.ix_(FILTER_STATES, FILTER_STATES)]
-    assert np.linalg.eigvalsh(block).min() > -1e-9 * np.linalg.eigvalsh(block).max()
+    eigenvalues = np.linalg.eigvalsh(covariance[np.ix_(FILTER_STATES, FILTER_STATES)])
+    assert eigenvalues.min() > -1e-9 * eigenvalues.max()
+    f["mean"][0][SOC] = 0.4
+    larger = 1.1 * f["soc_std"] ** 2 / fitted.covariance[fit_module.SOC, fit_module.SOC]
+    adopt_state(slow_fit.estimator, replace(fitted, covariance=larger * fitted.covariance))
+    assert f["mean"][0][SOC] == 0.4
 
 
 def test_a_fault_that_a_fit_shows_remains_until_a_fit_without_it(

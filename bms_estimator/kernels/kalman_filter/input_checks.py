@@ -41,17 +41,17 @@ RESTORED_STD = 0.05
 """Additional std of the SOC after the last good state was restored."""
 MAX_SOC_STD = 0.4
 """Maximum std of the SOC."""
-SIGN_S = 300.0
-"""Averaging time of the check of the current's sign [s]. Only time in which the current changes counts."""
-MIN_EVIDENCE = 0.1
-"""Minimum ``sign_evidence`` for a fault of the sign. It is 0 without data and 1 for a full average over ``SIGN_S``."""
+SIGN_S, SIGN_SAMPLES = 100.0, 30.0
+"""Minimum averaging time of the check of the current's sign, in s and in samples. Only time in which the current changes counts."""
+MIN_EVIDENCE = 0.3
+"""Minimum ``sign_evidence`` for a fault of the sign. It is 0 without data and 1 for a full average."""
 WRONG_SIGN_SLOPE = 0.25
 """Minimum ratio of voltage to current changes for a fault of the sign, in multiples of R_s. A right sign gives -1, a wrong
 sign gives 1."""
 MIN_CORRELATION = 0.5
 """Minimum correlation of voltage and current changes for a fault of the sign. A right sign gives -1 and a wrong sign 1 if the
 changes exceed the noise of the voltage. If the noise dominates, as with small loads of a large pack, the correlation over
-``SIGN_S`` is random, with a std of 0.13 for one sample in 10 s."""
+``SIGN_SAMPLES`` is random, with a std of 0.13."""
 MAX_CHANGE_RATIO = 5.0
 """Limit of a voltage change, in multiples of the change that the resistances explain, so that a glitch to zero does not
 dominate the average."""
@@ -265,7 +265,7 @@ def track_current_sign(c: Record, p: Record, dt_s: float, current_a: float, volt
     c.slow_v += share * (voltage_v - c.slow_v)
     c.slow_a += share * (current_a - c.slow_a)
     visible = min(1.0, (ohm * change_a / (VISIBLE_V * p.series)) ** 2)
-    weight = visible * min(1.0, dt_s / SIGN_S)
+    weight = visible * dt_s / max(SIGN_S, SIGN_SAMPLES * dt_s)
     c.sign_evidence += weight * (1.0 - c.sign_evidence)
     c.change_v_a += weight * (change_v * change_a - c.change_v_a)
     c.change_a2 += weight * (change_a * change_a - c.change_a2)

@@ -4,7 +4,6 @@ import csv
 from pathlib import Path
 
 from tests.conftest import SHARED_DATA
-from tests.estimator.anywhere.score import Score
 from tests.estimator.month.cases import Case
 from tests.estimator.month.electrochemical import RECORDED
 from tests.estimator.month.groups import GROUPS, group_score, title
@@ -42,13 +41,8 @@ def table(cases: tuple[Case, ...] = SMALL_CASES) -> Table:
         with fits_every(FIT_INTERVAL_S):
             days = run(case, SHARED_DATA)
         scores = {title(g): group_score(days, g) for g in GROUPS if g[0] <= case.days}
-        results |= {(case.name, name): numbers(s) for name, s in scores.items() if s is not None}
+        results |= {(case.name, name): (s.rmse, s.cover, s.std, s.score) for name, s in scores.items() if s is not None}
     return results
-
-
-def numbers(s: Score) -> tuple[float, ...]:
-    """Return the columns of the table that follow case and days."""
-    return s.rmse, s.cover, s.std, s.score
 
 
 def write(results: Table, path: Path = SUMMARY_PATH) -> None:
