@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from bms_estimator.calibration.automatic.calibrate import calibrate
     from bms_estimator.calibration.elements.identify import identify
     from bms_estimator.calibration.validate import validate
-    from bms_estimator.estimator import Estimator, estimate
+    from bms_estimator.estimator.estimator import Estimator, estimate
     from bms_estimator.model.cell import load_cell
     from bms_estimator.model.pack_model import write_cell
     from bms_estimator.pack.pack import Pack, new_pack

@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast.available_power import DURATIONS_S, ForecastRows, PowerLimits, known_power_w
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, RESISTANCES
 from bms_estimator.kernels.forecast.charge import charge_current, time_to_full

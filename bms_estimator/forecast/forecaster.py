@@ -7,9 +7,8 @@ from typing import Self
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
-from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.forecast.available_power import (
     Forecast,
     ForecastCurve,

@@ -7,9 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import TraceBlock, compiled_estimator
+from bms_estimator.estimator.estimator import Estimator, TraceBlock, compiled_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.estimator.settings_plausibility import load_cutoff_v

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import MIN_BIAS_OF_R_STD, MIN_SOC_STD
 from bms_estimator.estimator.fitted_state import FittedState
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.pack_model.history import History
 

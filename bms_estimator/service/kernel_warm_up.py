@@ -4,9 +4,8 @@ import gc
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import compiled_estimator
+from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW

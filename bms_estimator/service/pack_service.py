@@ -14,7 +14,7 @@ from structlog.contextvars import bind_contextvars
 
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.edge.block_sender import BlockSender
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.estimator.stability_conditions import observer_warnings
 from bms_estimator.model.errors import UserError

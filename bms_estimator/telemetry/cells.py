@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.kernels.cells.records import ReadingFault
 from bms_estimator.model.arrays import Records

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import ACTIVATION, NAMES, TAFEL
 from bms_estimator.kernels.observer.series_resistance import MIN_CURRENT_C
 from bms_estimator.kernels.stability_margin import VALID_STD

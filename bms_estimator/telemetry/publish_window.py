@@ -12,8 +12,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS, accumulate_charge_energy
 from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, accumulate_window
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO

@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import CURVE_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import GRID, REFERENCE_C
 from bms_estimator.kernels.kalman_filter.hypotheses import MAX_STD_OF_ONE_HYPOTHESIS, spawn_hypotheses

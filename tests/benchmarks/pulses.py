@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 from scipy.ndimage import median_filter
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats, SampleBlock
 from tests.benchmarks.recipes import FROM_START, GROUPS, SOC_ERRORS, Group, cell_file, chosen, load
 

@@ -22,7 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock
 from bms_estimator.settings.observer import Sampling
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, SOC_ERRORS, Case, cell_file, load_a

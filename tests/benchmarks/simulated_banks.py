@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import bms_estimator
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves

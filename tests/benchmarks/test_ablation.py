@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from tests.benchmarks.ablation import PARTS
 

@@ -12,8 +12,13 @@ from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, Case, Truth, cell_file
-from tests.estimator.anywhere.truth import simulate
+from tests.estimator.anywhere.cases import (
+    OXIDE,
+    PHOSPHATE,
+    Case,
+    cell_file,
+)
+from tests.estimator.anywhere.truth import Truth, simulate
 
 WRONG_CAPACITY = 1.2
 """Capacity of the cell file relative to the true one, which must not influence the result."""

@@ -6,8 +6,8 @@ import numpy as np
 import structlog
 
 from bms_estimator.checkpoint.state_files import StateFiles
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.pack.pack import Pack
 from bms_estimator.settings.pack import Settings
 from tests.simulated_pack import SimulatedPack

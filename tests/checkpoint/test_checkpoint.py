@@ -18,8 +18,7 @@ from numpy.lib.recfunctions import repack_fields
 
 from bms_estimator.checkpoint.arrays_file import pack_identity
 from bms_estimator.checkpoint.state_files import FORMAT, MAX_FILES, CheckpointFile, StateFiles
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import compiled_estimator
+from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.kernels.kalman_filter.records import OFFSET

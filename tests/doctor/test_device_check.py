@@ -14,8 +14,8 @@ from bms_estimator.doctor import device_check
 from bms_estimator.doctor.device_check import check_board, check_device, first_sample_timeout_s
 from bms_estimator.doctor.finding import Level
 from bms_estimator.model.cell import load_cell
-from bms_estimator.process.instance_lock import instance_lock
-from bms_estimator.simulation.simulated_bms import SimulatedBms
+from bms_estimator.process.state_folder import instance_lock
+from bms_estimator.simulation.simulated_pack import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial.port_list import KnownBoardFile

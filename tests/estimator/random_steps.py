@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
 from bms_estimator.model.arrays import SAMPLE, SampleBlock

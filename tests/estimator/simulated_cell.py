@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.cell_model.open_loop import branch_currents

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.protocols.base.reading_protocol import cell_block

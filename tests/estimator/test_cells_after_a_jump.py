@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from tests.forecast.simulated_load import changing_load
 

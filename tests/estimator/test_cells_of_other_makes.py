@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import Estimator, load_capture, load_cell
+from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.model.cell import load_cell
 from bms_estimator.protocols.base.polled_protocol import BMS_GAIN_STD
 from bms_estimator.settings.observer import Sampling
+from bms_estimator.sources.captures.replay import load_capture
 from tests.estimator.anywhere.score import score
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.arrays import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.model.cell import load_cell

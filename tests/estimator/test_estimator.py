@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import SAMPLE_OUTCOMES
+from bms_estimator.estimator.estimator import SAMPLE_OUTCOMES, Estimator
 from bms_estimator.estimator.stability_conditions import failed_conditions, lemma_conditions
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.arrays import SAMPLE, SampleBlock, SampleStatus

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.hypotheses import spawn_after_gap, spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, NODE, Noise
 from bms_estimator.model.arrays import Floats, SampleBlock

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import Estimator, load_capture, load_cell
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
-from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.cell import CellModel, TableOcv, load_cell
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.sources.captures.replay import load_capture
 from tests.estimator.simulated_cell import TRUTH, pulses
 
 FAULT_S = 3600.0, 7200.0

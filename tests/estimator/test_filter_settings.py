@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bms_estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, SLOW_DIFFUSION, SOC_GRID, ladder_of_branches
 from bms_estimator.estimator.identified_parameters import present_elements
 from bms_estimator.kernels.cell_model import chen_mora

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator import estimate, load_capture, load_cell
+from bms_estimator.estimator.estimator import estimate
+from bms_estimator.model.cell import load_cell
+from bms_estimator.sources.captures.replay import load_capture
 
 ROUNDING = 1e-9
 """Relative tolerance for the different rounding of other processors."""

@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.cli.captures.replay_summary import Summary
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.pack_model import load_fuel_cell

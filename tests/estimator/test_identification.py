@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import fitted_parameter, present_elements
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.kernels.identifier import set_adaptation_targets

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.observer import Sampling
 from tests.estimator.simulated_cell import simulate_file

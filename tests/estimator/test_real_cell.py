@@ -6,10 +6,11 @@ The captures start full, so that the true SOC is counted.
 import numpy as np
 import pytest
 
-from bms_estimator import Estimator, estimate, load_capture, load_cell
+from bms_estimator.estimator.estimator import Estimator, estimate
 from bms_estimator.model.arrays import SampleBlock
-from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.columns import Columns
+from bms_estimator.sources.captures.replay import load_capture
 from tests.estimator.anywhere.run import run_of
 from tests.estimator.anywhere.score import score
 from tests.estimator.simulated_cell import run_divided

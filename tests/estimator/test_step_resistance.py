@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S
 from bms_estimator.kernels.kalman_filter.records import LN_R0
 from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock

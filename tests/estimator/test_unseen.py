@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.observer import IdentifierSettings

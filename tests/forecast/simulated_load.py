@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.pack.pack import Pack

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.forecast.available_power import QUANTILE_STDS, PowerLimits, cell_power_limits, unknown_values
 from bms_estimator.forecast.capability import write_capability

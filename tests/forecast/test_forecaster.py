@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast import projection
 from bms_estimator.forecast.available_power import FORECAST
 from bms_estimator.forecast.forecaster import MAX_INTERVAL_S, Forecaster

@@ -5,7 +5,7 @@ import contextlib
 import numpy as np
 from hypothesis import strategies as st
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_slots import CellSlots

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.estimator.stability_conditions import failed_conditions
 from bms_estimator.kernels.step import SampleOutcome

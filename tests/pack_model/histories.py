@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, HYSTERESIS_SOC, ROW_SOC
 from bms_estimator.kernels.cell_model.rc_ladder import TAUS
 from bms_estimator.model.cell import load_cell

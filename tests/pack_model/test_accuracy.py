@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.kalman_filter.anchors import FULL
 from bms_estimator.model.arrays import Floats

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import load_cell

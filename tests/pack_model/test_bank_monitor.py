@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW, ROW_SOC
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack_model.bank_comparison import ComparedCell

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import LN_Q, SOC

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import compiled_estimator
+from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.resume import resume_history

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.estimator.fitted_state import FILTER_STATES
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET, SOC
 from bms_estimator.model.arrays import SampleBlock, SampleStatus

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import Trip, constant_trip
 from bms_estimator.kernels.forecast.given_load import simulate_given_load

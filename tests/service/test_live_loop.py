@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import compiled_estimator
+from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import Clock

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import NO_CELLS
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock

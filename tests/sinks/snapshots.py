@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast.available_power import Forecast, ForecastCurve, unknown_values
 from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import CellModel, load_cell

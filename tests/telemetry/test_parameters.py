@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import SOC_GRID, ladder_of_branches
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import CellModel, Ladder, load_cell

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.arrays import SAMPLE, fields

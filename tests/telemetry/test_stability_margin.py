@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import TraceBlock, make_estimator
+from bms_estimator.estimator.estimator import Estimator, TraceBlock, make_estimator
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell

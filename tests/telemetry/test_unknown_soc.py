@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.payloads.snapshot import Alarm

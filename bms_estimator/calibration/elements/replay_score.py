@@ -8,7 +8,7 @@ smallest for the true interval.
 import numpy as np
 
 from bms_estimator.calibration.cleaning.clean_capture import CleanCapture
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SAMPLE, Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.charge_count import step_charges_as

@@ -26,7 +26,7 @@ from bms_estimator.calibration.thesis.series_resistance import (
     mean_of,
     series_resistance,
 )
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, ROOM_C, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.cell_model.rc_ladder import weak_share
 from bms_estimator.model.arrays import Floats, SampleBlock

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellDeviations
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows

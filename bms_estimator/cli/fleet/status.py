@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, ServerAddress
+from bms_estimator.cli.fleet.server_options import DEFAULT_SERVER, Ca, Creds, Server, on_server
 from bms_estimator.cli.options.table import count_text, print_table
-from bms_estimator.cli.fleet.server_options import on_server
 from bms_estimator.model.errors import UserError
 
 if TYPE_CHECKING:

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.arrays_file import pack_identity
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
-from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.estimator.estimator import Estimator, make_estimator
 from bms_estimator.estimator.settings_plausibility import load_cutoff_v
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.arrays_file import without_observer
 from bms_estimator.edge.block import Block
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.fleet.fits.messages import FitResult
 from bms_estimator.fleet.hour_row import HOUR_S
 from bms_estimator.fleet.packs.pack_type import Digest, PackType, PackTypes

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats, Records
 from bms_estimator.model.cell import CellModel
 from bms_estimator.pack.pack import Pack

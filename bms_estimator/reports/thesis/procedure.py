@@ -32,7 +32,7 @@ from bms_estimator.calibration.thesis.series_resistance import (
     mean_of,
     series_resistance,
 )
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError

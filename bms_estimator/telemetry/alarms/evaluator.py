@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
-from bms_estimator.estimator.estimator import TraceBlock
+from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows
 from bms_estimator.kernels.alarms.records import CELLS, FAULTY_BOARD, LINK_LOST, NAMES
 from bms_estimator.model.arrays import NO_CELLS, NO_PROBES, CellBlock, ProbeBlock, SampleBlock, SampleStatus

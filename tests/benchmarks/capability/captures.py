@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.settings.observer import BOARD
 from tests.benchmarks.recipes import Recipe, cell_file, load

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast.available_power import cell_power_limits, unknown_values
 from bms_estimator.forecast.capability import projected_pack, write_capability
 from bms_estimator.forecast.load_history import LoadHistory

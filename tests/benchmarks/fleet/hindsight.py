@@ -23,10 +23,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.queries.duckdb_queries import LIMITS, Limits, run_query
 from bms_estimator.fleet.queries.parquet_files import write
-from bms_estimator.fleet.worker.hour_summary import HOUR_SUMS, Hour, add, begin, row
+from bms_estimator.fleet.worker.hour_summary import add, begin, row
+from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
 from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.cell import CellModel
 from bms_estimator.settings.pack import PackSettings

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast.available_power import Forecast
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.cell_estimator import CellEstimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.observer import BOARD

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Iterator
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import MIN_INTERVAL_S, Forecaster
 from bms_estimator.forecast.projection import DRAWS, MIN_OBSERVED_BLOCK_S
 from bms_estimator.forecast.trip import Trip, constant_trip, profile_trip

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels import step as kernel
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import SampleBlock

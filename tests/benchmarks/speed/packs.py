@@ -15,15 +15,14 @@ import psutil
 
 from tests.benchmarks.speed.live import (
     MEASURE_S,
-    MOSQUITTO,
     PATIENCE_S,
     PROGRAM,
     SETTLE_S,
-    Broker,
     TimedBoard,
     pack_file,
 )
 from tests.benchmarks.table import Row
+from tests.mosquitto import MOSQUITTO, Broker
 
 PACKS, RATE_HZ, PUBLISH_RATE_HZ = 20, 10, 1.0
 MAX_CPU, MAX_MIB = 0.25, 400.0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.anchors import EMPTY
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.pack_model import equations, fit, handover, history, intervals, prediction, prior

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import Floats
 from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.benchmarks.weeks.parts import Part

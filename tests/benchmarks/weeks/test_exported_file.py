@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import identified_cell
 from bms_estimator.model.cell import CellModel
 from bms_estimator.pack_model.slow_fit import SlowFit

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import delta, ocv, r_s
 from bms_estimator.model.cell import Bounds, load_cell

@@ -13,7 +13,7 @@ from bms_estimator.calibration.thesis.adaptive_run import (
     average_parameters,
     averaging_window,
 )
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.thesis.simulation import discharge

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pyarrow import parquet
 
-from bms_estimator import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 from tests.command_line import run
 from tests.telemetry.alarm_captures import Line, record
 

@@ -15,10 +15,12 @@ import pytest
 from pyarrow import BufferOutputStream, parquet
 from pyarrow.csv import read_csv
 
-from bms_estimator import estimate, load_capture, load_cell
+from bms_estimator.estimator.estimator import estimate
 from bms_estimator.forecast.available_power import FORECAST
 from bms_estimator.kernels.cell_model.chen_mora import delta
+from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
+from bms_estimator.sources.captures.replay import load_capture
 from bms_estimator.telemetry.state import NOT_IDENTIFIED
 from tests.command_line import run
 

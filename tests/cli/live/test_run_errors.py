@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bms_estimator import __version__
 from bms_estimator.cli.main import COMMANDS
+from bms_estimator.version import __version__
 from tests.command_line import PROGRAM, run
 
 OUTPUTS = [

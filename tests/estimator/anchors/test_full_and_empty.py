@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
 from bms_estimator.estimator.anchor_settings import between_limits
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock, SampleStatus
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.payloads.health import AnchorReport

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.records import LN_Q
 from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock
 from bms_estimator.model.cell import CellModel, TableOcv, load_cell

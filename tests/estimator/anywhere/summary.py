@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.records import LN_Q
 from tests.estimator.anywhere.cases import CASES, SOC_ERRORS, Capture, Case, capture
 from tests.estimator.anywhere.run import run_of

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
 from tests.estimator.anywhere.cases import CASES

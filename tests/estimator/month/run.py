@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.pack.pack import Pack

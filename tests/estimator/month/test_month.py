@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SampleStatus
 from bms_estimator.pack_model.cell_curves import CellCurves
 from tests.conftest import SHARED_DATA

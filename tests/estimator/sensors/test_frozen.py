@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SampleBlock, SampleStatus
 from bms_estimator.settings.observer import EXACT, IdentifierSettings, ObserverSettings, Sampling
 from tests.estimator.simulated_cell import TRUTH, measured, run_divided

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.settings.observer import Sampling
 from bms_estimator.settings.pack import Settings
 from tests.estimator.simulated_cell import TRUTH, pulses

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter import ekf
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE, OFFSET, SOC, STATES
 from bms_estimator.model.arrays import SAMPLE

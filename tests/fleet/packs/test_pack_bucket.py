@@ -6,6 +6,7 @@ import nats
 import pytest
 
 from bms_estimator.edge.subjects import CELLS_BUCKET, PACKS_BUCKET
+from bms_estimator.fleet.nats.bucket_reader import read_bucket
 from bms_estimator.fleet.nats.stream_reader import BATCH_MESSAGES, StreamError
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.packs.pack_bucket import (
@@ -13,7 +14,6 @@ from bms_estimator.fleet.packs.pack_bucket import (
     WriteCounts,
     purge_keys,
     put_new,
-    read_bucket,
     remove_keys,
     write_bucket,
 )

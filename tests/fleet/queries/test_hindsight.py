@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture, load_cell
 from bms_estimator.fleet.queries.duckdb_queries import run_query
 from bms_estimator.fleet.queries.parquet_files import write
+from bms_estimator.model.cell import load_cell
+from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks.fleet.hindsight import limits, normalized_errors, slots
 
 SLOT_S = 60.0

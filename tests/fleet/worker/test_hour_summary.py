@@ -6,10 +6,18 @@ import math
 import numpy as np
 import pytest
 
-from bms_estimator import Estimator, load_cell
 from bms_estimator.edge.block import Block
-from bms_estimator.fleet.worker.hour_summary import HOUR_SUMS, Hour, add, begin, hour_of, row
+from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.fleet.hour_row import Hour
+from bms_estimator.fleet.worker.hour_summary import (
+    add,
+    begin,
+    hour_of,
+    row,
+)
+from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
 from bms_estimator.model.arrays import SAMPLE
+from bms_estimator.model.cell import load_cell
 from bms_estimator.model.pack_model import load_model
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.settings.pack import PackSettings

@@ -12,8 +12,7 @@ from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import make_estimator
 from bms_estimator.fleet.hour_row import Hour
 from bms_estimator.fleet.worker import pack_records
-from bms_estimator.fleet.worker.checkpoint.checkpoint_format import CURRENT_LAYOUT
-from bms_estimator.fleet.worker.pack_records import cell_count, cell_layout
+from bms_estimator.fleet.worker.pack_records import CURRENT_LAYOUT, cell_count, cell_layout
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.model.arrays import NO_CELLS
 from bms_estimator.model.cell import load_cell

@@ -9,7 +9,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
-from bms_estimator.process.tasks import end
+from bms_estimator.process.runtime import end
 from tests.fleet.checkpoints import raw
 
 END_SEQUENCE = 9

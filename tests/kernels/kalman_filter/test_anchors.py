@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import TAUS
 from bms_estimator.kernels.kalman_filter.anchors import EMPTY, FULL, apply_anchor, detect_anchor
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, LN_Q, NODE, NODES, OFFSET, SOC

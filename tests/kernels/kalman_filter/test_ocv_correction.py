@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from bms_estimator.estimator import Estimator
+from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import ocv_correction_with_std
 from bms_estimator.kernels.kalman_filter.ocv_correction import (
     node_error_scale,

@@ -11,11 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bms_estimator.calibration.thesis.adapt import printed_bounds
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.thesis.experiment import CLAIMS, Claim, Experiment, RecordedCaptures, Result, claim
 from bms_estimator.reports.thesis.experiment_figures import FIGURES, MAX_LOADS, constant_loads, step_loads
-from bms_estimator.reports.thesis.procedure import Capture, Kind, Procedure, kind_of, printed_bounds
+from bms_estimator.reports.thesis.procedure import (
+    Capture,
+    Kind,
+    Procedure,
+    kind_of,
+)
 from bms_estimator.reports.thesis.report_items import Reproduction
 from bms_estimator.sources.captures.replay import load_capture
 from tests.benchmarks.thesis import chapter5

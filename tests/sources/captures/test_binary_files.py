@@ -6,8 +6,8 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from bms_estimator import load_capture
 from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.replay import load_capture
 from tests.sources.captures.binary_exports import arbin_sheets, write_mpr, write_nda, write_xlsx
 from tests.sources.captures.cycler_exports import measure
 from tests.sources.captures.test_dialects import assert_is_the_measurement

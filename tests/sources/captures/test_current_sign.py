@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.sensor import SensorSettings
-from bms_estimator.sources.captures.replay import open_capture
+from bms_estimator.sources.captures.replay import load_capture, open_capture
 from tests.sources.captures.cycler_exports import maccor, measure, text
 
 M = measure()

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture
 from bms_estimator.model.columns import Columns
+from bms_estimator.sources.captures.replay import load_capture
 from tests.sources.captures.cycler_exports import EXPORTS, Export, compressed, measure, stamps, text
 
 

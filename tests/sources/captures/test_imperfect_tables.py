@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.replay import load_capture
 from tests.sources.captures.cycler_exports import biologic, durations, measure, novonix, text
 from tests.sources.captures.test_dialects import assert_is_the_measurement
 

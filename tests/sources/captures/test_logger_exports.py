@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture
 from bms_estimator.model.errors import UserError
+from bms_estimator.sources.captures.replay import load_capture
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 from tests.sources.captures.cycler_exports import Export, Measurement, measure, stamps, text
 

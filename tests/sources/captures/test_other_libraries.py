@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture
+from bms_estimator.sources.captures.replay import load_capture
 from tests.sources.captures.cycler_exports import EXPORTS, Export
 
 pytestmark = pytest.mark.thorough

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture
 from bms_estimator.calibration.cleaning.clean_capture import remove_glitches, soc_by_counting
 from bms_estimator.model.errors import UserError
-from bms_estimator.sources.captures.replay import open_capture
+from bms_estimator.sources.captures.replay import load_capture, open_capture
 from bms_estimator.sources.captures.tables.layout import Role
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 from bms_estimator.sources.captures.tables.table_reader import Table

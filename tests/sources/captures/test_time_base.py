@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator import load_capture
 from bms_estimator.model.columns import Columns
+from bms_estimator.sources.captures.replay import load_capture
 from tests.sources.captures.cycler_exports import text
 
 START = datetime(2026, 3, 4, 9, 0, 0, tzinfo=UTC)
