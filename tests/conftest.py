@@ -67,7 +67,6 @@ LONG_FILES = (
     "tests/deploy/test_machines.py",
     "tests/fleet/worker/test_partition.py",
     "tests/fleet/worker/test_pack_fits.py",
-    "tests/fleet/packs/test_erasure.py",
     "tests/fleet/ingest/test_backfill.py",
     "tests/fleet/ingest/test_ingest.py",
     "tests/fleet/page/test_browser.py",

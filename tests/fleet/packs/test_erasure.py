@@ -52,6 +52,7 @@ async def occurrences(nc, pack):
     return sorted(set(found))
 
 
+@pytest.mark.thorough
 async def test_erased_pack_is_in_no_stream_checkpoint_and_memory_and_the_other_pack_keeps_its_state(tmp_path, capsys):
     with running(tmp_path, partitions=1) as cluster:
         nc = await connected(cluster.urls)
