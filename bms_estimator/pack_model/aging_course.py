@@ -30,7 +30,7 @@ AT_REFERENCE = np.ones(1)
 
 
 @dataclass(frozen=True)
-class Course:
+class QuantityCourse:
     """Values of one quantity over the history.
 
     Attributes:
@@ -68,9 +68,9 @@ class AgingCourse:
     """
 
     end_s: float
-    capacity: Course
-    series: Course
-    total: Course
+    capacity: QuantityCourse
+    series: QuantityCourse
+    total: QuantityCourse
 
 
 @single_threaded()
@@ -96,7 +96,7 @@ def aging_course(cell: CellCurves, rows: NDArray[np.void], previous: PackFit) ->
     mean, covariance = mixture_moments(mixture_weights(minima), [_ln_values(equations, each) for each in minima])
     elapsed_s, n = rows["elapsed_s"][equations.intervals.starts], equations.intervals.count
     capacity, series, total = (
-        Course(elapsed_s, np.exp(mean[part]), covariance[part, part])
+        QuantityCourse(elapsed_s, np.exp(mean[part]), covariance[part, part])
         for part in (slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n))
     )
     return AgingCourse(float(rows["elapsed_s"][-1]), capacity, series, total)

@@ -165,7 +165,7 @@ def history_from_arrays(arrays: Arrays) -> tuple[History, PackFit | None]:
     if fit is None:
         return history, None
     elapsed_s, soc, curves = (_fit_field(arrays, name) for name in ("row_elapsed_s", "row_soc", "curves"))
-    if elapsed_s.shape != soc.shape or elapsed_s.ndim != 1 or not 0 < elapsed_s.size <= 2 * MAX_ROWS:
+    if elapsed_s.shape != soc.shape or elapsed_s.ndim != 1 or not 0 < elapsed_s.size <= MAX_ROWS:
         raise ValueError("the SOCs of the fit are damaged")
     if curves.ndim != 2 or curves.shape[1] != _CURVE_UNKNOWNS or not 0 < curves.shape[0] <= SAVED_MINIMA:
         raise ValueError("the curves of the fit are damaged")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from bms_estimator.pack_model.aging_course import RESISTANCE_SOC, AgingCourse, Course
+from bms_estimator.pack_model.aging_course import RESISTANCE_SOC, AgingCourse, QuantityCourse
 from bms_estimator.plot.style import COLORS, STYLE, draw_band
 from bms_estimator.version import __version__
 
@@ -244,7 +244,7 @@ def _rows(course: AgingCourse) -> tuple[tuple[str, ...], ...]:
     )
 
 
-def _change_per_month(course: Course, end_s: float) -> str:
+def _change_per_month(course: QuantityCourse, end_s: float) -> str:
     """Return the relative change per month with its std."""
     if end_s - course.elapsed_s[0] < MIN_CHANGE_S or course.value.size == 1:
         return "-"
@@ -253,7 +253,7 @@ def _change_per_month(course: Course, end_s: float) -> str:
     return f"{100.0 * change / months:+.1f} ± {100.0 * std / months:.1f} %"
 
 
-def _draw(end_s: float, course: Course, scale: float, label: str, color: str, ax: Any) -> None:
+def _draw(end_s: float, course: QuantityCourse, scale: float, label: str, color: str, ax: Any) -> None:
     days = (course.elapsed_s - end_s) / DAY_S
     value, std = scale * course.value, scale * course.std
     draw_band(ax, days, value - 2.0 * std, value + 2.0 * std, color=color)
