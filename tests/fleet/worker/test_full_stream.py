@@ -114,9 +114,10 @@ async def test_no_block_is_lost_if_the_stream_overflows_without_a_worker_and_the
         await nc.close()
 
 
-async def test_status_warns_when_unsaved_blocks_fill_half_of_the_stream(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+async def test_status_and_heartbeats_warn_when_unsaved_blocks_fill_half_of_the_stream(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(worker_module, "UNSAVED_CHECK_S", 0.1)
     with running(tmp_path, 1, partitions=PARTITIONS) as cluster:
         nc = await connected(cluster.urls)
         await make_streams(nc, partitions=PARTITIONS, raw_bytes=1 << 20)
@@ -130,6 +131,13 @@ async def test_status_warns_when_unsaved_blocks_fill_half_of_the_stream(
             assert code == 0
             warnings.append(" of the stream RAW are blocks that no checkpoint includes" in out)
         assert warnings == [False, True]
+        stop = asyncio.Event()
+        work = asyncio.create_task(worker_module.work(worker_module.Options(cluster.url, "w"), stop))
+        async with Heartbeats(nc) as heartbeats:
+            await heartbeats.until(lambda last: "w" in last and "no checkpoint includes" in last["w"].trouble)
+            await heartbeats.until(lambda last: last["w"].unsaved_s > 0.0)
+        stop.set()
+        await work
         pointer = CheckpointPointer(kept=(CheckpointInfo(sequence=3, object="p0.1", bytes=1, made_s=1.79e9),))
         bucket = await js.key_value(subjects.CHECKPOINTS_BUCKET)
         await bucket.put(pointer_key(0), pointer.model_dump_json().encode())
@@ -157,23 +165,4 @@ async def test_blocks_that_the_limit_of_one_pack_drops_are_named(
             await bucket.put(pointer_key(0), pointer.model_dump_json().encode())
             warning = (await unsaved_blocks(nc, range(PARTITIONS))).warning
             assert ("stores 10 blocks of a pack, has dropped blocks of often" in warning) == has_dropped
-        await nc.close()
-
-
-async def test_heartbeat_warns_when_unsaved_blocks_fill_half_of_the_stream(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(worker_module, "UNSAVED_CHECK_S", 0.1)
-    with running(tmp_path, 1, partitions=PARTITIONS) as cluster:
-        nc = await connected(cluster.urls)
-        await make_streams(nc, partitions=PARTITIONS, raw_bytes=1 << 20)
-        for _ in range(6):
-            await nc.jetstream().publish(subjects.raw("p1"), bytes(100 << 10))
-        stop = asyncio.Event()
-        work = asyncio.create_task(worker_module.work(worker_module.Options(cluster.url, "w"), stop))
-        async with Heartbeats(nc) as heartbeats:
-            await heartbeats.until(lambda last: "w" in last and "no checkpoint includes" in last["w"].trouble)
-            await heartbeats.until(lambda last: last["w"].unsaved_s > 0.0)
-        stop.set()
-        await work
         await nc.close()

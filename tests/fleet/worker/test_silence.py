@@ -25,9 +25,12 @@ from bms_estimator.process.runtime import end, until_first_ends
 from tests.fleet.nats_cluster import running
 from tests.fleet.partition_stream import estimates_of
 from tests.fleet.workers import Heartbeats, block, end_states, estimated, load_packs, send, until
+from tests.patience import LONG_S
 
 PARTITIONS = 4
 PACKS = ["p1", "p2", "p3"]
+DEFERRED_BLOCKS = 40
+"""Number of deferred blocks of a pack that becomes known."""
 BLOCKS = 3
 """Number of blocks of each pack."""
 REPLAYED_BLOCKS = 50
@@ -125,6 +128,22 @@ async def test_worker_that_lost_its_partition_and_owns_it_again_continues_from_t
             state = lease.partition.state(pack)
             assert state is not None
             assert estimates_of(state["estimator"]) == estimated(registry, pack, 1)
+
+
+async def test_block_of_another_pack_is_processed_before_the_deferred_blocks_of_a_pack_that_became_known(
+    nc: Client,
+) -> None:
+    registry, late, other = await load_packs(nc, PACKS), PACKS[0], PACKS[1]
+    known = {pack: registry(pack) for pack in PACKS if pack != late}
+    async with _running_lease(nc, known.get, DEFERRED_BLOCKS) as lease:
+        messages = DEFERRED_BLOCKS * len(PACKS)
+        await until(lambda: lease.partition and lease.partition.sequence == messages, lambda: lease.totals)
+        states = await nc.subscribe(subjects.published("*", "state"))
+        known[late] = registry(late)
+        lease.on_settings_changed(late)
+        await send(nc, other, block(other, DEFERRED_BLOCKS + 1))
+        packs = [(await states.next_msg(LONG_S)).subject for _ in range(DEFERRED_BLOCKS + 1)]
+        assert packs.index(subjects.published(other, "state")) < DEFERRED_BLOCKS
 
 
 def _pack_count(partition: int) -> int:
