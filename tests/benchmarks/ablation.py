@@ -89,6 +89,8 @@ PARTS: dict[str, Change] = {
     "error of the capacity": change_settings(capacity_std=0.0),
     "drift of offset and capacity": change_settings(offset_s=1e12, aged_soc=1e9),
     "unknown load before switch-on": change_settings(load_c=0.0, load_level_c=1e-3),
+    "tempered weights": change_settings(half_likelihood_exponent=0.5),
+    "reduced innovation variance in weights": change_settings(min_innovation_scale=1.0),
     "penalty for large biases": change_settings(inconsistency_penalty=0.0),
 }
 """Part of the filter, and the change of the settings that disables it."""

@@ -1,8 +1,9 @@
 """Filter bank: several filters that start at different SOCs and are merged when they agree.
 
 At switch-on, SOC and polarization are unknown, and far from the true SOC the OCV has another slope. Therefore filters
-start at ``HYPOTHESES`` SOCs around the initial one. Each is weighted by its likelihood. Filters that agree are merged, and
-unlikely ones are removed. The output is the mean and standard deviation of the mixture.
+start at ``HYPOTHESES`` SOCs around the initial one. Each is weighted by its likelihood to a power below 1 (tempering),
+because successive errors of the model are not independent. Filters that agree are merged, and unlikely ones are removed.
+The output is the mean and standard deviation of the mixture.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS. Above 1 Hz, each update uses the mean of about a second's samples.
 """
@@ -83,6 +84,8 @@ BEYOND_STD = 0.03
 the limit."""
 HYST_STD = 0.7
 """Initial std of the hysteresis state h."""
+EARLIER_LOAD_S = 1800.0
+"""Time constant with which effects of the unknown load before switch-on decay [s]."""
 REINITIALIZE_STDS = 4.0
 """Bias above which the SOC is re-initialized, in standard deviations. A wrong SOC is more likely than such a model error."""
 INCONSISTENT_STDS = 2.0
@@ -359,9 +362,12 @@ def update_weight(s: Record, p: Record, q: int, innovation_v: float, linear_v2: 
         linear_v2: S without the linearization error [V^2].
         variance_v2: R [V^2].
     """
+    scale = innovation_scale(s, p)
     if s.window.time_s > 0.0 and not s.window.gap:
-        linear_v2 = repeated_variance(s, p, innovation_v * innovation_v, linear_v2, variance_v2)
-    s.ln_weight[q] -= 0.5 * (innovation_v * innovation_v / linear_v2 + math.log(linear_v2))
+        linear_v2 = repeated_variance(s, p, innovation_v * innovation_v / scale, linear_v2, variance_v2)
+    s.ln_weight[q] -= p.half_likelihood_exponent * (
+        innovation_v * innovation_v / (scale * linear_v2) + math.log(linear_v2)
+    )
     if s.count > 1:
         s.ln_weight[q] -= p.inconsistency_penalty * max(normalized_bias_squared(s, p, q) - INCONSISTENT_STDS**2, 0.0)
 
@@ -385,6 +391,23 @@ def repeated_variance(s: Record, p: Record, likeliest_v2: float, linear_v2: floa
     likeliest_v2 = min(linear_v2, max(variance_v2, likeliest_v2))
     share = min(REPEATED_SHARE * (extrapolation_factor(p, s.temperature_c) - 1.0), 1.0)
     return likeliest_v2 * (linear_v2 / likeliest_v2) ** share
+
+
+@njit(cache=True)
+def innovation_scale(s: Record, p: Record) -> float:
+    """Return the expected ratio of the innovation variance to S.
+
+    R and the biases cover the loads and cells that the cell file describes worst. Innovations usually become smaller when the
+    effects of the load before switch-on have decayed. The term ln S would then decide between the hypotheses and favor the
+    smallest S. Outside the temperature range of the cell file the ratio increases and reaches 1 at a distance of ``OUTSIDE_K``.
+    """
+    return min(
+        max(
+            math.exp(-s.seeded_s / EARLIER_LOAD_S),
+            p.min_innovation_scale * extrapolation_factor(p, s.temperature_c) ** 2,
+        ),
+        1.0,
+    )
 
 
 @njit(cache=True)

@@ -100,6 +100,11 @@ class Noise:
     The odds are even, because nothing is known about the gap."""
     event_s: float = 3600.0
     """P(0): time constant with which this probability grows with the duration of the gap [s], of the order of a charge."""
+    half_likelihood_exponent: float = 0.17
+    """Half of the likelihood's exponent in the weights of hypotheses. It is below 0.5, because successive errors are not
+    independent."""
+    min_innovation_scale: float = 0.25
+    """Minimum factor on S in the weights of hypotheses, because R and the biases cover the worst case."""
     inconsistency_penalty: float = 0.1
     """Log-weight penalty. At each update a hypothesis whose bias exceeds 2 std loses this factor times the excess of the
     squared bias in variances."""
