@@ -1,7 +1,6 @@
 """Steps of the setup on a page."""
 
 import asyncio
-import re
 import socket
 
 import pytest
@@ -10,12 +9,10 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.setup import new_pack
 from bms_estimator.setup.answers import Answers
 from bms_estimator.setup.broker_login import BrokerLogin
-from bms_estimator.setup.first_estimate import estimate_text
 from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.new_pack import create_pack
 from bms_estimator.setup.page import session as session_module
 from bms_estimator.setup.page.session import SetupSession
-from tests.sinks.snapshots import CELL_SNAPSHOT
 
 
 def test_invalid_settings_leave_no_file(tmp_path):
@@ -43,14 +40,6 @@ def test_the_page_of_a_second_pack_gets_another_port(tmp_path, monkeypatch):
         packs = [create_pack(file, Answers(device, None, "house", "lfp", 100.0, 8, 1), n) for n, file in files.items()]
     assert packs[0].settings.page.address.port > port  # the next port that is free
     assert packs[1].settings.page.address.port == port  # that of the setup page, which ends
-
-
-def test_an_soc_that_is_not_known_is_no_number_in_the_first_estimate():
-    texts = [estimate_text(CELL_SNAPSHOT.estimate.model_copy(update={"soc_known": known})) for known in (True, False)]
-    assert [re.findall("SOC [0-9.]+%|SOC is not known yet", text) for text in texts] == [
-        ["SOC 50.0%"],
-        ["SOC is not known yet"],
-    ]
 
 
 async def test_a_second_search_ends_the_first(tmp_path, monkeypatch):
