@@ -6,7 +6,6 @@ passwords, whose data are deleted when it ends.
 
 import asyncio
 import contextlib
-import errno
 import json
 import socket
 import sys
@@ -24,6 +23,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.page_sink import Pages
 from bms_estimator.process.child_process import find_server, terminate_with_parent
+from bms_estimator.process.listener import is_free
 from bms_estimator.process.runtime import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
@@ -141,22 +141,10 @@ def choose_port(port: int | None, default_port: int, option: str) -> int:
         UserError: The requested port is in use, or the user may not open it.
     """
     if port is not None:
-        if not _is_free(port):
+        if not is_free(port):
             raise UserError(f"port {port}: in use or not permitted; without {option} a free port is chosen")
         return port
-    return default_port if _is_free(default_port) else _any_free_port()
-
-
-def _is_free(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port with old connections in TIME_WAIT is free
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError as error:
-            if error.errno in (errno.EADDRINUSE, errno.EACCES):  # EACCES: a privileged port
-                return False
-            raise
-    return True
+    return default_port if is_free(default_port) else _any_free_port()
 
 
 def _any_free_port() -> int:

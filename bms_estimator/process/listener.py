@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import resource
 import socket
 import time
@@ -30,6 +31,19 @@ OPEN_RETRY_S = 10.0
 """Retry interval of an address that cannot be listened on [s]."""
 
 log = structlog.get_logger(__name__)
+
+
+def is_free(port: int) -> bool:
+    """Return True if this user may listen on a TCP port of 127.0.0.1, and no program does."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a port with old connections in TIME_WAIT is free
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            if error.errno in (errno.EADDRINUSE, errno.EACCES):  # EACCES: a privileged port
+                return False
+            raise
+    return True
 
 
 def _default_limit() -> int:

@@ -57,6 +57,8 @@ class Answers:
     """Broker that answered during the search; None: no broker answered."""
     sensor: tuple[tuple[str, object], ...] = ()
     """Settings of ``[sensor]`` from the comparison with a multimeter: key and value of each."""
+    page_listen: str = DEFAULT_LISTEN
+    """Address of the page."""
 
     @property
     def voltage_v(self) -> float | None:
@@ -96,7 +98,7 @@ class Answers:
         tables = {"pack": pack, **self.device.tables_with(brokers.get("source", {}))}
         if self.sensor:
             tables["sensor"] = {**tables.get("sensor", {}), **dict(self.sensor)}
-        tables["page"] = {"listen": DEFAULT_LISTEN}
+        tables["page"] = {"listen": self.page_listen}
         # without a login, every client of the broker could acknowledge a critical alarm, after which a relay closes
         commands = {"commands": ["acknowledge_alarm"]} if self.broker and self.broker.username else {}
         return tables | ({"mqtt": {**brokers["mqtt"], **commands}} if "mqtt" in brokers else {})

@@ -12,6 +12,7 @@ from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.setup.measurement import first_sample_timeout_s
 from bms_estimator.sources.factory import open_source
+from bms_estimator.telemetry.state import UNKNOWN_SOC
 
 MAX_RESTING_C = 0.1
 """Current relative to the capacity [1/h]. Above it, the overvoltage makes the first estimate inexact."""
@@ -79,6 +80,8 @@ def estimate_text(estimate: Estimate) -> str:
     values = f"{estimate.voltage_v:.2f} V, {estimate.current_a:.2f} A"
     if estimate.soc is None:
         return values
+    if not estimate.soc_known:
+        return f"{values}; {UNKNOWN_SOC}"
     band = "" if estimate.soc_std is None else f" ± {2.0 * estimate.soc_std:.1%} (2 standard deviations)"
     return f"SOC {estimate.soc:.1%}{band}, {values}"
 

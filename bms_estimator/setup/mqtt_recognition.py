@@ -17,8 +17,6 @@ from bms_estimator.sources.mqtt.payload_value import InvalidValueError, read_cel
 
 MAX_PUBLISHERS = 1000
 """Maximum number of publishers that are stored. Messages of further publishers are ignored."""
-MIN_LIVE_MESSAGES = 3
-"""Minimum number of live messages with a voltage or a current from which to conclude that a publisher sends only changes."""
 MAX_SILENT_S = 300.0
 """Setting ``source.max_silent_s`` of a publisher that sends only changes [s]."""
 _PLACEHOLDER = re.compile(r"\{(prefix|instance|cell|probe)\}")
@@ -50,6 +48,7 @@ class PublisherRecognition:
         self._values: dict[Publisher, dict[str, float]] = {}
         self._topics: dict[Publisher, str] = {}  # topic of the voltage
         self._live: dict[Publisher, dict[str, list[bytes]]] = {}  # live payloads by name of the value
+        self._retained: dict[Publisher, set[str]] = {}  # names of the retained values
 
     def add_message(self, topic: str, payload: bytes, *, retained: bool = False) -> None:
         """Store the values that the profiles with this topic read from the message."""
@@ -68,7 +67,10 @@ class PublisherRecognition:
                 self._values.setdefault(publisher, {}).update(values)
                 if template.quantity == "voltage":
                     self._topics[publisher] = topic
-                for name in () if retained else values:
+                if retained:
+                    self._retained.setdefault(publisher, set()).update(values)
+                    continue
+                for name in values:
                     self._live.setdefault(publisher, {}).setdefault(name, []).append(payload)
 
     def devices(self, broker: BrokerLogin) -> list[FoundDevice]:
@@ -90,11 +92,14 @@ class PublisherRecognition:
         return [_device(p, complete[p], broker, only_changes=self._sends_only_changes(p)) for p in best]
 
     def _sends_only_changes(self, publisher: Publisher) -> bool:
-        """Return True if voltage or current arrived several times, no live value was repeated, and most values were only retained."""
+        """Return True if a retained voltage, current or cell voltage stayed silent, and no live value was repeated.
+
+        A silent temperature is no sign, because some publishers send temperatures less often than the other values.
+        """
         live = self._live.get(publisher, {})
         repeated = any(a == b for payloads in live.values() for a, b in itertools.pairwise(payloads))
-        is_frequent = max((len(live.get(name, ())) for name in ("voltage", "current")), default=0) >= MIN_LIVE_MESSAGES
-        return is_frequent and not repeated and len(live) < 0.5 * len(self._values[publisher])
+        silent = self._retained.get(publisher, set()) - live.keys() - {"temperature", "soc", "capacity"}
+        return bool(silent) and not repeated
 
 
 @functools.cache

@@ -1,15 +1,18 @@
 """New pack: its settings file, and the command that runs its estimator."""
 
+import itertools
 import math
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bms_estimator.estimator.settings_plausibility import implausible_measurement
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.config_file import parse_toml
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.listener import is_free
 from bms_estimator.service.pack_check import check_settings, summarize
+from bms_estimator.settings.outputs import DEFAULT_LISTEN, parse_listen
 from bms_estimator.settings.pack import Settings, create_pack_file
 from bms_estimator.settings.settings_template import settings_file
 from bms_estimator.setup.answers import Answers
@@ -33,15 +36,23 @@ class NewPack:
         return summarize(self.settings, self.cell)
 
 
-def create_pack(file: Path, answers: Answers) -> NewPack:
+def create_pack(file: Path, answers: Answers, setup_port: int = 0) -> NewPack:
     """Check the settings of a pack. Write its settings file, and password files for its brokers to the same folder.
 
-    Invalid settings are not written.
+    Invalid settings are not written. The page gets the first free port from the default port, because each pack has a page.
+
+    Args:
+        file: Settings file to create.
+        answers: Answers about the pack.
+        setup_port: Port of the setup page, which is free when the service starts; 0: no setup page.
 
     Raises:
         UserError: A setting is invalid, or the file exists or cannot be written.
         ModuleNotFoundError: The optional package of the source is missing.
     """
+    default = parse_listen(DEFAULT_LISTEN)
+    port = next(port for port in itertools.count(default.port) if port == setup_port or is_free(port))
+    answers = replace(answers, page_listen=f"{default.host}:{port}")
     settings = parse_toml(settings_file(Settings, answers.temporary_tables), Settings, str(file))
     pack = settings.pack
     cell = load_cell(pack.cell, pack.capacity_ah).pack(pack.series, pack.parallel)

@@ -89,16 +89,27 @@ def test_publishers_without_a_current_and_other_messages_are_ignored() -> None:
     assert find({"jk/sensor/jk_total_voltage/state": "26.4", "zigbee2mqtt/lamp": '{"state": "ON"}', "a/b": "1"}) == []
 
 
-def test_a_publisher_of_changes_is_recognized_by_its_silent_topics() -> None:
-    """A publisher that also sends unchanged values needs no ``max_silent_s``."""
-    for payloads, expected in ((("1", "2", "3"), 300.0), (("1", "2", "2"), None)):
-        recognition = PublisherRecognition()
-        for topic, payload in JK_NODE.items():
-            recognition.add_message(topic, payload.encode(), retained=True)
+@pytest.mark.parametrize(
+    ("live", "expected"),
+    [
+        ({}, 300.0),  # nothing changed
+        ({"current": ["1"]}, 300.0),
+        ({"current": ["1", "2", "2"]}, None),
+        ({"total_voltage": ["52"], "current": ["1"], "cell_voltage_1": ["3.3"], "cell_voltage_2": ["3.3"]}, None),
+    ],
+)
+def test_a_publisher_of_changes_is_recognized_by_its_silent_topics(
+    live: Mapping[str, list[str]], expected: float | None
+) -> None:
+    """A publisher that also sends unchanged values needs no ``max_silent_s``, nor one of which only a temperature is silent."""
+    recognition = PublisherRecognition()
+    for topic, payload in JK_NODE.items():
+        recognition.add_message(topic, payload.encode(), retained=True)
+    for name, payloads in live.items():
         for payload in payloads:
-            recognition.add_message("home/jk/sensor/jk_current/state", payload.encode())
-        (device,) = recognition.devices(BROKER)
-        assert device.tables["source"].get("max_silent_s") == expected
+            recognition.add_message(f"home/jk/sensor/jk_{name}/state", payload.encode())
+    (device,) = recognition.devices(BROKER)
+    assert device.tables["source"].get("max_silent_s") == expected
 
 
 def test_two_profiles_with_equally_many_values_are_both_offered() -> None:

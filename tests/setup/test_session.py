@@ -1,10 +1,12 @@
 """Steps of the setup on a page."""
 
 import asyncio
+import socket
 
 import pytest
 
 from bms_estimator.model.errors import UserError
+from bms_estimator.setup import new_pack
 from bms_estimator.setup.answers import Answers
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import FoundDevice
@@ -27,6 +29,17 @@ def test_another_capacity_than_that_of_the_device_is_a_warning(tmp_path):
     same, other = (create_pack(tmp_path / f"{each.name}.toml", each).warnings for each in answers)
     text = "pack.capacity_ah: the pack has 100 Ah, but its device reports 280 Ah"
     assert [text in warnings for warnings in (same, other)] == [False, True]
+
+
+def test_the_page_of_a_second_pack_gets_another_port(tmp_path, monkeypatch):
+    device = FoundDevice("/dev/none", "JK-BMS", {"sensor": {"port": "/dev/none", "protocol": "jk"}})
+    with socket.create_server(("127.0.0.1", 0)) as first_page:
+        port = first_page.getsockname()[1]
+        monkeypatch.setattr(new_pack, "DEFAULT_LISTEN", f"127.0.0.1:{port}")
+        files = {setup_port: tmp_path / f"pack{setup_port}.toml" for setup_port in (0, port)}
+        packs = [create_pack(file, Answers(device, None, "house", "lfp", 100.0, 8, 1), n) for n, file in files.items()]
+    assert packs[0].settings.page.address.port > port  # the next port that is free
+    assert packs[1].settings.page.address.port == port  # that of the setup page, which ends
 
 
 async def test_a_second_search_ends_the_first(tmp_path, monkeypatch):

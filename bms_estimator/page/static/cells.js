@@ -33,11 +33,11 @@ export function drawCells(s, report) {
 /** Cell with the lowest SOC in a report; undefined without a report. */
 const weakestOf = (report) => report?.cells?.find((cell) => cell.number === report.weakest);
 
-/** Name the cell with the lowest SOC, its capacity once that of the pack is learned, and faulty cells. */
+/** Name the cell with the lowest SOC, which the state has, its capacity once that of the pack is learned, and faulty cells. */
 export function drawRanks(report, capacity) {
 	const weakest = weakestOf(report);
 	hide(document.querySelector("[data-of=weakestcell]"), !weakest);
 	if (!weakest) return;
 	const faults = report.cells.filter((c) => c.fault).map((c) => `cell ${c.number}: ${c.fault}`);
-	put("weakestcell", [`cell ${weakest.number}, SOC ${f.percent(weakest.soc)} ± ${f.percent(2 * weakest.soc_std)} %${capacity?.valid ? `, capacity ${f.percent(weakest.capacity_ratio, 0)} % of the others` : ""}`, ...faults].join("; "));
+	put("weakestcell", [`cell ${weakest.number}${capacity?.valid ? `, capacity ${f.percent(weakest.capacity_ratio, 0)} % of the others` : ""}`, ...faults].join("; "));
 }

@@ -142,17 +142,18 @@ class MqttSource(BaseSource):
     )
     max_silent_s: Positive | None = Field(
         default=None,
-        description="maximum time between two messages of a publisher that sends only changes. Until then the last values are used again, and retained values are accepted while availability_topic reports the publisher online; default: the publisher sends a value in each interval_s",
+        description="maximum time between two messages of a publisher that sends only changes. Until then the last values are used again, and a retained voltage or current is accepted while availability_topic reports the publisher online; default: the publisher sends a value in each interval_s",
     )
     slow_max_age_s: Positive = Field(
-        default=300.0, description="maximum age of a temperature or cell voltage in a sample"
+        default=300.0,
+        description="maximum age of a temperature or cell voltage in a sample, unless availability_topic reports the publisher online",
     )
     interval_s: Positive = Field(
         default=10.0, description="expected sample period; values are stale after three periods"
     )
     availability_topic: str | None = Field(
         default=None,
-        description="topic on which the publisher reports offline, directly or by its last will; the service gives this as the reason for missing samples",
+        description="topic on which the publisher reports offline, directly or by its last will; the service gives this as the reason for missing samples. While it is online, temperatures and cell voltages do not expire, and retained ones are accepted",
     )
     ask: Mapping[str, str] = Field(
         default={}, description="requests to a publisher that only answers requests, as a table of payloads by topic"

@@ -41,6 +41,7 @@ class SetupSession:
     Args:
         file: Settings file to create.
         on_estimate: Called with each estimate of the new pack.
+        port: Port of the setup page.
 
     Attributes:
         step: Step that the page shows.
@@ -57,6 +58,7 @@ class SetupSession:
 
     file: Path
     on_estimate: Callable[[Estimate], object]
+    port: int = 0
     step: Step = Step.SEARCH
     error: str = ""
     places: Sequence[str] = field(default_factory=default_places)
@@ -151,7 +153,7 @@ class SetupSession:
         if self.invalid:
             return
         require_new(self.file)
-        self.pack = create_pack(self.file, answers)
+        self.pack = create_pack(self.file, answers, self.port)
         self.step = Step.DONE
         self._task = asyncio.create_task(self._estimate(self.pack), name="first estimate")
 

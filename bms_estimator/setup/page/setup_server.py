@@ -48,7 +48,7 @@ class SetupServer(WebServer):
 
     def __init__(self, settings: PageSettings, file: Path, token: str | None = None) -> None:
         self._latest_estimate = LatestValues()
-        self._session = SetupSession(file, self._show)
+        self._session = SetupSession(file, self._show, settings.address.port)
         self._form_key, self._lock = secrets.token_hex(16), asyncio.Lock()
         steps: dict[str, Callable[[Fields], Awaitable[None]]] = {
             "/search": self._search,

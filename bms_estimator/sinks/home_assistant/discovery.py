@@ -21,7 +21,9 @@ from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
 ESTIMATE = field_entities(Estimate, "all")
 """Entities of every pack."""
 CHARGE_STATE = field_entities(Estimate, "batteries") | {
-    "soc_std_percent": Entity("State of charge, standard deviation", "%", 1, 0.2, icon="plus-minus-variant"),
+    "soc_std_percent": Entity(
+        "State of charge, standard deviation", "%", 1, 0.2, icon="plus-minus-variant", immediate_step=2.0
+    ),
     "time_to_cutoff_h": Entity("Time to cut-off", "h", 2, 0.05, "duration", is_primary=True, icon="timer-sand"),
     "time_to_cutoff_p05_h": raw_entity("Time to cut-off, 5 % quantile", "h", 2, "duration"),
     "time_to_cutoff_p95_h": raw_entity("Time to cut-off, 95 % quantile", "h", 2, "duration"),
@@ -85,6 +87,8 @@ VALUES = "home_assistant"
 MIN_EXPIRY_S = 30
 """Minimum of ``expire_after``, the age at which Home Assistant shows a value as unavailable [s]."""
 _ALARM_CLASSES: Mapping[str, str] = {name: kind.device_class for name, kind in ALARM_KINDS.items()}
+_ALARM_LABELS = {"soc_low": "State of charge low", "collapse_risk": "Cut-off within 5 min likely"}
+"""Names of alarms whose key is not an owner's word."""
 _ALARM_AVAILABILITY = "{{ 'online' if value_json.watched or value_json.active else 'offline' }}"
 """Template of an alarm's availability. A raised alarm stays available even if its quantity is lost later."""
 FORMER_SENSORS = ("r_s_ohm",)
@@ -243,7 +247,7 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
     topic = f"{root}/alarm/{name}"
     return {
         "platform": "binary_sensor",
-        "name": name.replace("_", " ").capitalize().replace("Soc", "State of charge"),
+        "name": _ALARM_LABELS.get(name, name.replace("_", " ").capitalize()),
         "state_topic": topic,
         "value_template": "{{ 'ON' if value_json.active else 'None' if value_json.unknown_reason else 'OFF' }}",
         "json_attributes_topic": topic,
@@ -251,7 +255,7 @@ def _alarm(name: str, root: str) -> dict[str, Any]:
         "availability": [{"topic": f"{root}/availability"}, {"topic": topic, "value_template": _ALARM_AVAILABILITY}],
         "availability_mode": "all",
         "device_class": _ALARM_CLASSES[name],
-    }
+    } | ({"enabled_by_default": False} if name == "stability_margin_low" else {})
 
 
 def _controls(root: str) -> dict[str, dict[str, Any]]:

@@ -78,7 +78,8 @@ class SampleAssembler:
     value of the other is used up to ``stale_s``, because some publishers send only changes. The line marks a value that
     an earlier sample has used, because the estimator must not use a voltage twice, or with a current of another time.
     A message that lacks a quantity does not erase its last value, because some publishers send only a part of their values in
-    each message. Retained messages are rejected, because their age is unknown.
+    each message. A retained temperature or cell voltage is used while the publisher reports itself online. A retained voltage or
+    current is rejected, because its age is unknown, unless the publisher sends only changes.
 
     Attributes:
         faults: Latest error of each quantity without a value in its last message, by name of the quantity.
@@ -192,14 +193,16 @@ class SampleAssembler:
             if self._is_online:
                 waiting, self._retained = self._retained, {}
                 for retained_topic, retained_payload in waiting.items():
-                    self.add_message(retained_topic, retained_payload, now_s, retained=False)
+                    self.add_message(retained_topic, retained_payload, now_s, retained=True)
             return
         bindings = [(binding, match) for binding in self._bindings if (match := binding.pattern.fullmatch(topic))]
-        if retained and not (self._sends_only_changes and self._is_online):
+        if retained and not self._is_online:
             self._counters["retained"] += bool(bindings)
-            if bindings and self._sends_only_changes and len(self._retained) < MAX_RETAINED:
+            if bindings and self._availability_topic and len(self._retained) < MAX_RETAINED:
                 self._retained[topic] = payload
             return
+        if retained and self._settings.max_silent_s is None:
+            bindings = [(binding, match) for binding, match in bindings if binding.quantity not in EXPIRING_QUANTITIES]
         has_conflict = False
         for binding, match in bindings:
             number = int(match[1]) if match.re.groups else None
@@ -257,7 +260,7 @@ class SampleAssembler:
             if 1 <= number <= highest and not math.isnan(value):
                 key = (*location, number)
                 messages = self._values[key].messages + 1 if key in self._values else 1
-                permanent = self._sends_only_changes and self._is_online and binding.quantity not in EXPIRING_QUANTITIES
+                permanent = self._is_online and binding.quantity not in EXPIRING_QUANTITIES
                 expiry_s = math.inf if permanent else now_s + self._max_age_s[binding.quantity]
                 self._values[key] = _StoredValue(value, now_s, expiry_s, messages)
         if binding.quantity in REQUIRED_QUANTITIES:
@@ -290,11 +293,6 @@ class SampleAssembler:
             return False
         self._conflicts[key] = f"{binding.topic}: {binding.quantity} {detector.text}"
         return True
-
-    @property
-    def _sends_only_changes(self) -> bool:
-        """True if the publisher sends only changes, and reports on a topic whether it is online."""
-        return self._settings.max_silent_s is not None and bool(self._availability_topic)
 
     def _is_fresh(self, stored: _StoredValue, now_s: float) -> bool:
         """Return True unless a value is too old. A value without expiry lasts while the publisher is online."""

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from tests.sinks.snapshots import CELL_SNAPSHOT, STACK_SNAPSHOT
 
 TOPIC_ROOT = "bms/pack"
 SETTINGS = HomeAssistantSettings()
+DASHBOARD = Path(__file__).parents[3] / "deploy" / "home-assistant" / "dashboard.yaml"
 
 
 def components_of(message: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -177,10 +179,11 @@ def test_values_are_not_repeated_without_estimates_so_that_they_expire() -> None
     assert times_s == [0.0]
 
 
-@pytest.mark.parametrize(("name", "before"), [("current_a", 0.0), ("temperature_c", None)])
+@pytest.mark.parametrize(("name", "before"), [("current_a", 0.0), ("temperature_c", None), ("soc_std", 0.2)])
 def test_a_rare_change_and_a_first_value_are_published_within_five_seconds(name: str, before: float | None) -> None:
     stream = ((t, cell_snapshot_with(**{name: before if t < 43.0 else 3.0})) for t in map(float, range(60)))
-    published_s = next(t for t, _, payload in home_assistant_messages(stream) if payload.get(name) == 3.0)
+    values = {"soc_std_percent": 300.0} if name == "soc_std" else {name: 3.0}
+    published_s = next(t for t, _, payload in home_assistant_messages(stream) if values.items() <= payload.items())
     assert published_s <= 48.0
 
 
@@ -343,6 +346,16 @@ def test_entity_ids_do_not_depend_on_configured_names() -> None:
         for each in (english_components, german_components)
     ]
     assert ids[0] == ids[1]
+
+
+def test_the_dashboard_shows_all_alarms_that_are_enabled_by_default() -> None:
+    components = discovery(SETTINGS, DiscoveryInputs(CELL_SNAPSHOT.info, alarms=ALARMS), TOPIC_ROOT, 0.0)["components"]
+    alarms = [component for key, component in components.items() if key.startswith("alarm_")]
+    expert, owner = (
+        [a["default_entity_id"] for a in alarms if a.get("enabled_by_default", True) is on] for on in (False, True)
+    )
+    assert expert == ["binary_sensor.bms_pack_alarm_stability_margin_low"]
+    assert set(re.findall(r"binary_sensor\.\w+", DASHBOARD.read_text(encoding="utf-8"))) == set(owner)
 
 
 def test_error_on_an_unknown_name_lists_the_entities() -> None:

@@ -360,19 +360,21 @@ def test_temperature_is_used_for_five_minutes() -> None:
     assert "temperature_c" not in feed(assembler, voltage_and_current, 301.0)[0]
 
 
-def test_retained_and_constant_values_count_while_a_publisher_of_changes_is_online() -> None:
+@pytest.mark.parametrize("max_silent_s", [None, 600])
+def test_retained_and_constant_values_count_while_a_publisher_is_online(max_silent_s: float | None) -> None:
     assembler = SampleAssembler(
         json_source(
             temperature={"topic": "home/probe"},
             soc={"topic": "home/soc"},
             availability_topic="home/status",
-            max_silent_s=600,
+            max_silent_s=max_silent_s,
         )
     )
     state = [("home/pack", '{"u": 52, "i": 1}'), ("home/probe", "21"), ("home/soc", "62")]
     assert feed(assembler, state, retained=True) == []
-    (sample,) = feed(assembler, [("home/status", "online")], 1.0, retained=True)
-    assert (sample["temperature_c"], sample["device_soc"]) == (21.0, 0.62)
+    samples = feed(assembler, [("home/status", "online")], 1.0, retained=True)
+    complete = {"voltage_v": 52.0, "current_a": 1.0, "temperature_c": 21.0, "device_soc": 0.62}
+    assert samples == [complete] * bool(max_silent_s)
     (sample,) = feed(assembler, [("home/pack", '{"u": 51, "i": 2}')], 500.0)
     assert (sample["temperature_c"], sample["device_soc"]) == (21.0, 0.62)
     feed(assembler, [("home/status", "offline")], 501.0)
