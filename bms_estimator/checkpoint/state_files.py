@@ -295,6 +295,22 @@ class StateFiles:
                 reasons[name] = f"{REFUSED}{error}"
         return replace(state, history=arrays.get(HISTORY, {}), load=arrays.get(LOAD, {}), reasons=reasons)
 
+    def save(self, state: PackState, *, whole: bool = False) -> None:
+        """Write each part that ``state``, from ``Pack.state``, contains.
+
+        Args:
+            state: State of the pack.
+            whole: True: write the whole checkpoint, not only its changes.
+
+        Raises:
+            OSError: A file cannot be written.
+        """
+        if isinstance(state.record, np.ndarray):
+            self.checkpoint.save(state.record, state.curves, state.cells, whole=whole)
+        for arrays, file in ((state.history, self.history), (state.load, self.load)):
+            if arrays:
+                file.save(arrays)
+
     def restore(self, pack: Pack) -> str:
         """Restore a new pack, quarantine each refused file, and log the outcomes.
 

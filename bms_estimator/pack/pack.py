@@ -14,7 +14,7 @@ from bms_estimator.estimator.restore import restore_state
 from bms_estimator.estimator.settings_plausibility import load_cutoff_v
 from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows, power_limits
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.forecast.load_history import restore_load
+from bms_estimator.forecast.load_history import load_arrays, restore_load
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import NO_CELLS, NO_SOC, CellBlock, Floats, SampleBlock
 from bms_estimator.model.pack_model import PackModel
@@ -33,7 +33,7 @@ from bms_estimator.pack.state import (
 from bms_estimator.pack_model.fit import PackFit
 from bms_estimator.pack_model.handover import use_fitted_curves
 from bms_estimator.pack_model.history import History
-from bms_estimator.pack_model.saved import fit_from_arrays, history_from_arrays
+from bms_estimator.pack_model.saved import curve_arrays, fit_from_arrays, history_arrays, history_from_arrays
 from bms_estimator.pack_model.slow_fit import FIT_INTERVAL_S, SlowFit, Submit, run_now
 from bms_estimator.settings.pack import Settings
 
@@ -169,6 +169,22 @@ class Pack:
             self._device_soc_std = None
         return None
 
+    def state(self, *parts: str) -> PackState:
+        """Return a copy of the state for ``restore``, which later samples leave unchanged.
+
+        Args:
+            parts: Parts that the copy contains: ``CHECKPOINT`` with record, curves and cells, ``HISTORY``, ``LOAD``; default: all.
+        """
+        parts, fit, forecaster = parts or (CHECKPOINT, HISTORY, LOAD), self.slow_fit, self.forecaster
+        return PackState(
+            record=self.estimator.record.copy() if CHECKPOINT in parts else {},
+            curves=curve_arrays(fit.fit) if CHECKPOINT in parts and fit else {},
+            cells=self.cells.saved_state if CHECKPOINT in parts and self.cells else {},
+            history=history_arrays(fit.history, fit.saved_fit) if HISTORY in parts and fit else {},
+            load=load_arrays(forecaster.load, forecaster.past) if LOAD in parts and forecaster else {},
+            declared=DeclaredValues.of(self.model),
+        )
+
     def restore(self, state: PackState, gap_s: float) -> dict[str, str]:
         """Restore the state of an earlier run, before the first sample. A part that is refused begins empty.
 
@@ -230,7 +246,7 @@ class Pack:
         """Restore the estimator's record. Return False without a valid one."""
         if CHECKPOINT in state.reasons:
             return False
-        if reason := restore_state(self.estimator, state.record, gap_s):
+        if reason := restore_state(self.estimator, state.record_fields, gap_s):
             outcomes[CHECKPOINT] = f"{REFUSED}{reason}"
             return False
         soc, self._device_soc_std = self.estimator.soc, None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.cells.records import LEAK
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, LN_R0
+from bms_estimator.model.arrays import Records, fields
 from bms_estimator.model.pack_model import PackModel
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -35,8 +36,8 @@ class DeclaredValues(NamedTuple):
 class PackState:
     """State of a pack at a save. A part that is missing or refused is empty."""
 
-    record: Arrays = field(default_factory=dict)
-    """Fields of ESTIMATOR_STATE by their names, as from ``fields``."""
+    record: Arrays | Records = field(default_factory=dict)
+    """Record of dtype ESTIMATOR_STATE, shape (1,); or its fields by their names, as from ``fields``."""
     curves: Arrays = field(default_factory=dict)
     """Arrays of the fit to whose curves ``record`` is relative (``pack_model.saved.curve_arrays``); empty: the curves are those
     of the cell file."""
@@ -45,13 +46,18 @@ class PackState:
     history: Arrays = field(default_factory=dict)
     """History and last fit (``pack_model.saved.history_arrays``)."""
     load: Arrays = field(default_factory=dict)
-    """Observed load (``forecast.saved_load.load_arrays``)."""
+    """Observed load (``forecast.load_history.load_arrays``)."""
     gap_s: float = math.inf
     """Time since ``record`` was saved [s]; infinite if unknown."""
     declared: DeclaredValues | None = None
     """Declared values of the pack at the save; None: the present ones."""
     reasons: Mapping[str, str] = field(default_factory=dict)
     """Reason why a part is empty, by its name; it begins with ``REFUSED`` if the part exists."""
+
+    @property
+    def record_fields(self) -> Arrays:
+        """Fields of ``record`` by their names."""
+        return dict(fields(self.record)) if isinstance(self.record, np.ndarray) else self.record
 
 
 def with_capacity(
@@ -70,7 +76,7 @@ def with_capacity(
         filter_settings: Record of dtype EKF_SETTINGS by the cell file.
     """
     ratio, ln_r = after.capacity_ah / before.capacity_ah, math.log(before.r_s_ohm / after.r_s_ohm)
-    record = {name: v / ratio if name.endswith(".throughput_soc") else v for name, v in state.record.items()}
+    record = {name: v / ratio if name.endswith(".throughput_soc") else v for name, v in state.record_fields.items()}
     mean, covariance = record["filter.mean"].copy(), record["filter.covariance"]
     shifts = {LN_Q: (-math.log(ratio), float(filter_settings["capacity_std"]))}
     curves = dict(state.curves)

@@ -14,12 +14,10 @@ import structlog
 
 from bms_estimator.checkpoint.run_file import RunCounters
 from bms_estimator.checkpoint.state_files import StateFiles
-from bms_estimator.forecast.load_history import load_arrays
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack.state import REFUSED
+from bms_estimator.pack.state import CHECKPOINT, HISTORY, LOAD, REFUSED
 from bms_estimator.pack_model.fit import PackFit
-from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.service.alarm_hooks import AlarmHooks
 from bms_estimator.service.alarm_monitor import AlarmMonitor
 from bms_estimator.service.service_status import ServiceStatus
@@ -212,9 +210,8 @@ class CheckpointWriter:
         progress = self._progress
         if not progress[0] or (progress == self._saved_progress and self._fit is self._saved_fit):
             return True
-        state, fit = self._pack.estimator.record.copy(), self._fit
-        curves, cells = curve_arrays(fit), self._pack.cells.saved_state if self._pack.cells else None
-        if not await self._write(lambda: self._files.checkpoint.save(state, curves, cells, whole=whole)):
+        state, fit = self._pack.state(CHECKPOINT), self._fit
+        if not await self._write(lambda: self._files.save(state, whole=whole)):
             return False
         self._status.checkpoint, self._saved_progress, self._saved_fit = "saved", progress, fit
         return True
@@ -229,12 +226,12 @@ class CheckpointWriter:
         revision = model.revision
         if revision == self._saved_revision and not (is_last and model.unsaved_rows):
             return True
-        arrays, discarded = history_arrays(model.history, model.saved_fit), model.discarded
+        state, discarded = self._pack.state(HISTORY), model.discarded
 
         def save() -> None:
             if discarded != self._discarded and file.path.exists():
                 log.warning("history", file=str(file.path), outcome=f"{REFUSED}its fit fails; {file.quarantine()}")
-            file.save(arrays)
+            self._files.save(state)
 
         if await self._write(save, file.path):
             self._saved_revision, self._discarded = revision, discarded
@@ -243,11 +240,11 @@ class CheckpointWriter:
 
     async def _save_load(self) -> None:
         """Save the observed load, if there are new samples."""
-        samples, forecaster, file = self._progress[0], self._pack.forecaster, self._files.load
-        if forecaster is None or samples == self._samples_of_saved_load:
+        samples = self._progress[0]
+        if self._pack.forecaster is None or samples == self._samples_of_saved_load:
             return
-        arrays = load_arrays(forecaster.load, forecaster.past)
-        if await self._write(lambda: file.save(arrays), file.path):
+        state = self._pack.state(LOAD)
+        if await self._write(lambda: self._files.save(state), self._files.load.path):
             self._samples_of_saved_load = samples
 
     async def _write(self, write: Callable[[], None], path: Path | None = None) -> bool:

@@ -15,7 +15,7 @@ from tests.simulated_pack import SimulatedPack
 
 def saved_checkpoint(folder: Path, pack: SimulatedPack) -> StateFiles:
     """Save a checkpoint of a pack; return its files for the next run."""
-    StateFiles(folder, Settings(), pack.model).checkpoint.save(pack.estimator.record, cells=pack.cells.saved_state)
+    StateFiles(folder, Settings(), pack.model).save(pack.pack.state())
     return StateFiles(folder, Settings(), pack.model)
 
 

@@ -12,7 +12,6 @@ from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model import slow_fit as slow_fit_module
-from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.process.host import BootTimestamp
 from bms_estimator.settings.pack import Settings
 from tests.pack_model.quick_fit import LN_CAPACITY, quick_fit
@@ -45,14 +44,6 @@ def run(pack: Pack, hours: float, start_s: float = 0.0) -> None:
     pack.run(samples, np.round(history.cell_v, 3))
 
 
-def save(pack: Pack, to: StateFiles) -> None:
-    """Save the state of a pack."""
-    assert pack.slow_fit
-    assert pack.cells
-    to.checkpoint.save(pack.estimator.record, curve_arrays(pack.slow_fit.fit), pack.cells.saved_state)
-    to.history.save(history_arrays(pack.slow_fit.history, pack.slow_fit.saved_fit))
-
-
 def learned(pack: Pack, capacity_ah: float) -> tuple[float, float]:
     """Return the learned capacity [Ah] and the series resistance relative to a pack of 1 Ah."""
     estimator = pack.estimator
@@ -70,7 +61,7 @@ def test_a_corrected_capacity_keeps_soc_curves_and_what_was_learned(
     run(before, 3.0)
     assert before.slow_fit
     assert before.slow_fit.fits
-    save(before, files(tmp_path, wrong_ah))
+    files(tmp_path, wrong_ah).save(before.state())
     with capture_logs() as lines:
         assert files(tmp_path, CAPACITY_AH).restore(after) == f"restored: SOC {before.estimator.soc:.4f}"
     [line] = [line["outcome"] for line in lines if line["event"] == "capacity"]
@@ -107,7 +98,7 @@ def test_a_corrected_capacity_keeps_soc_curves_and_what_was_learned(
 def test_what_was_not_learned_follows_the_declared_capacity(tmp_path: Path) -> None:
     before, after = new_pack(SETTINGS, model(10.0)), new_pack(SETTINGS, model(20.0))
     run(before, 0.02)
-    save(before, files(tmp_path, 10.0))
+    files(tmp_path, 10.0).save(before.state())
     files(tmp_path, 20.0).restore(after)
     f = after.estimator.record[0]["filter"]
     assert abs(f["mean"][f["best"], [LN_Q, LN_R]]).max() < 0.05
@@ -116,11 +107,11 @@ def test_what_was_not_learned_follows_the_declared_capacity(tmp_path: Path) -> N
 def test_the_newest_file_is_restored_after_a_return_to_an_earlier_capacity(tmp_path: Path) -> None:
     pack = new_pack(SETTINGS, model(10.0))
     run(pack, 0.02)
-    save(pack, files(tmp_path, 10.0))
+    files(tmp_path, 10.0).save(pack.state())
     corrected = new_pack(SETTINGS, model(20.0))
     files(tmp_path, 20.0).restore(corrected)
     corrected.estimator.set_soc(0.25)
-    save(corrected, files(tmp_path, 20.0))
+    files(tmp_path, 20.0).save(corrected.state())
     back = new_pack(SETTINGS, model(10.0))
     assert files(tmp_path, 10.0).restore(back) == "restored: SOC 0.2500"
     assert files(tmp_path, 10.0).saved_pack().pack.estimator.state["soc"][0] == 0.25
@@ -129,7 +120,7 @@ def test_the_newest_file_is_restored_after_a_return_to_an_earlier_capacity(tmp_p
 def test_a_damaged_state_of_another_capacity_is_refused(tmp_path: Path) -> None:
     pack = new_pack(SETTINGS, model(10.0))
     run(pack, 0.02)
-    save(pack, files(tmp_path, 10.0))
+    files(tmp_path, 10.0).save(pack.state())
     path = files(tmp_path, 10.0).checkpoint.path
     with np.load(path) as content:
         arrays = dict(content)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from bms_estimator.checkpoint.arrays_file import HISTORY_SUFFIX, LOAD_SUFFIX
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
-from bms_estimator.forecast.load_history import load_arrays
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
 from bms_estimator.kernels.cells.records import BANK_STATE
 from bms_estimator.kernels.cells.records import CELL as CELL_STATE
@@ -24,7 +23,7 @@ from bms_estimator.pack_model import fit as fit_module
 from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model import solve
 from bms_estimator.pack_model.history import ReferenceDischarges, WeakCellTime
-from bms_estimator.pack_model.saved import curve_arrays, history_arrays, neutral_fit
+from bms_estimator.pack_model.saved import curve_arrays, neutral_fit
 from bms_estimator.pack_model.slow_fit import Submit, run_now
 from bms_estimator.settings.pack import Settings
 
@@ -102,9 +101,7 @@ class Pack:
 
     def save(self) -> None:
         """Write all files."""
-        self.files.checkpoint.save(self.estimator.record, curve_arrays(self.slow_fit.fit), self.cells.saved_state)
-        self.files.history.save(history_arrays(self.slow_fit.history, self.slow_fit.saved_fit))
-        self.files.load.save(load_arrays(self.forecaster.load, self.forecaster.past))
+        self.files.save(self.pack.state())
 
     def run(self, hours: float) -> None:
         """Process samples with cell voltages, without forecasts."""

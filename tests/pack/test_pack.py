@@ -5,13 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bms_estimator.model.arrays import SAMPLE, fields
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack, new_pack
-from bms_estimator.pack.state import PackState
+from bms_estimator.pack.state import CHECKPOINT, HISTORY
 from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.cell_curves import SOC_GRID
-from bms_estimator.pack_model.saved import curve_arrays, history_arrays
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.simulated_pack import SimulatedPack as SimulatedLoad
 from bms_estimator.simulation.simulated_pack import constant
@@ -110,13 +109,8 @@ def test_the_wait_for_the_first_sample_extends_the_gap_of_record_history_and_cel
     monkeypatch.setattr(slow_fit_module, "fit", quick_fit)
     before, model = new_pack(Settings(), SimulatedPack().model), SimulatedPack().model
     before.run(*recording)
-    assert before.slow_fit
-    assert before.cells
-    history = history_arrays(before.slow_fit.history, before.slow_fit.saved_fit)
-    curves = curve_arrays(before.slow_fit.fit)
-    state = PackState(dict(fields(before.estimator.record)), curves, before.cells.saved_state, history)
     pack = new_pack(Settings(), model)
-    outcomes = pack.restore(state, 10.0)
+    outcomes = pack.restore(before.state(CHECKPOINT, HISTORY), 10.0)
     assert set(outcomes) == {"checkpoint", "history"}
     assert all(outcome.startswith("restored") for outcome in outcomes.values())
     assert pack.cells

@@ -20,10 +20,10 @@ import gc
 import numpy as np
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
-from bms_estimator.model.arrays import SAMPLE, fields
+from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import new_pack
-from bms_estimator.pack.state import PackState
+from bms_estimator.pack.state import CHECKPOINT
 from bms_estimator.settings.pack import Settings
 from bms_estimator.service.kernel_compilation import argument_types, compile_call, compile_order
 from bms_estimator.service.kernel_warm_up import load_kernels
@@ -32,7 +32,7 @@ model, samples = load_cell("chen_mora").pack(4, 1), np.zeros(1, SAMPLE)
 samples["voltage_v"] = model.cell.nominal_voltage_v
 pack, restarted = new_pack(Settings(), model), new_pack(Settings(), model)
 pack.run(samples, np.full((1, 4), samples["voltage_v"] / 4))
-outcomes = restarted.restore(PackState(dict(fields(pack.estimator.record)), cells=pack.cells.saved_state), 60.0)
+outcomes = restarted.restore(pack.state(CHECKPOINT), 60.0)
 gc.unfreeze()
 kernels = [each for each in gc.get_objects() if isinstance(each, Dispatcher) and each.py_func.__module__.startswith("bms_estimator.")]
 loaded = {(f"{each.py_func.__module__}.{each.py_func.__qualname__}", types) for each in kernels for types in each.signatures}

@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +31,10 @@ from bms_estimator.fleet.worker.pack_state import (
 from bms_estimator.forecast.available_power import Forecast, unknown_values
 from bms_estimator.forecast.capability import write_usable_charge
 from bms_estimator.kernels.cells.records import BANK_STATE, CELL
-from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock, fields
+from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.health import Payload
-from bms_estimator.pack.state import CHECKPOINT, REFUSED, PackState
+from bms_estimator.pack.state import CHECKPOINT, REFUSED
 from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload, remaining_capacity_ah
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import ChargeEnergy, Window
@@ -133,15 +134,14 @@ class BlockProcessor:
             return False
         has_state = bool(self._hour["store"])  # 0 before the first block
         if _digest(delivery[STATE_DIGEST]) == pack_type.state_digest and has_state:
-            saved = unmigrated_fields
-            if saved is None:
-                saved = {name: v.copy() for name, v in fields(self._record["estimator"])}
+            self._load_cells(pack_type)
+            state = pack_type.pack.state(CHECKPOINT)
+            saved = state.record_fields if unmigrated_fields is None else unmigrated_fields
             record["estimator"] = np.zeros((), PACK_STATE["estimator"])
             # the observer's state also depends on settings outside ``STATE_DIGEST``; other states do not
             valid = saved if is_same_config else without_observer(saved)
-            cells = {"cells": self._unpacked.cells, "bank": self._unpacked.bank} if self._unpacked.cell_count else {}
-            state = PackState(record=valid, curves=self._fits.curves_in_force(), cells=cells)
             pack_type.cells.use_state(NO_CELL_STATES, np.zeros(1, BANK_STATE))
+            state = replace(state, record=valid, curves=self._fits.curves_in_force())
             outcomes = pack_type.pack.restore(state, self._gap_s(block))
             self._store_cells(pack_type)
             # the restored estimator has no last sample, and its counters begin at 0

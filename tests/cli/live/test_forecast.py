@@ -11,10 +11,10 @@ import pytest
 from bms_estimator.checkpoint.arrays_file import LOAD_SUFFIX
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.forecast.load_history import load_arrays
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import new_pack
+from bms_estimator.pack.state import CHECKPOINT, LOAD
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from tests.command_line import run
 
@@ -44,11 +44,7 @@ def pack(tmp_path_factory: pytest.TempPathFactory, samples: SampleBlock) -> Path
     settings, cell = load_pack(file)
     pack = new_pack(settings, cell)
     pack.run(samples)
-    estimator, forecaster = pack.estimator, pack.forecaster
-    assert forecaster
-    (folder / "state").mkdir()
-    CheckpointFile(folder / "state", settings, cell).save(estimator.record)
-    StateFiles(folder / "state", settings, cell).load.save(load_arrays(forecaster.load, forecaster.past))
+    StateFiles(folder / "state", settings, cell).save(pack.state(CHECKPOINT, LOAD))
     return file
 
 
