@@ -46,9 +46,9 @@ def test_soc_and_its_std_are_those_of_the_last_row(series: int) -> None:
     samples["voltage_v"] *= series
     estimator = Estimator(load_cell("ncr18650").pack(series, 1), initial_soc=0.8)
     assert math.isnan(estimator.soc)
-    assert math.isnan(estimator.soc_std)
+    assert math.isnan(estimator.weakest_cell_soc_std)
     last = estimator.run(samples)[-1]
-    assert (estimator.soc, estimator.soc_std) == (last["soc"], last["soc_std"])
+    assert (estimator.soc, estimator.weakest_cell_soc_std) == (last["soc"], last["soc_std"])
 
 
 def test_the_gain_of_the_observer_changes_no_estimate() -> None:
@@ -72,7 +72,7 @@ def test_the_gain_of_the_observer_changes_no_estimate() -> None:
 def test_soc_has_no_std_without_the_identifier() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
     estimator.run(noisy_load(200))
-    assert math.isnan(estimator.soc_std)
+    assert math.isnan(estimator.weakest_cell_soc_std)
 
 
 def test_a_restored_state_resumes_identically() -> None:
