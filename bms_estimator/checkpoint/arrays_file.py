@@ -306,11 +306,5 @@ def _is_small_change(
 
 
 def _is_omitted(name: str) -> bool:
-    """Return True for fields that are not saved, because they change slowly, are large, or are computed again for each sample."""
-    return name in (
-        "filter.covariance",
-        "filter.ohm",
-        "filter.h",
-        "filter.ph",
-        "filter.f",
-    ) or name.startswith(("checks.good_", "map.", "series_resistance.", "fit."))
+    """Return True for fields that are not saved, because they change slowly or are large."""
+    return name == "filter.covariance" or name.startswith(("checks.good_", "map.", "series_resistance.", "fit."))

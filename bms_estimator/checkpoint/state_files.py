@@ -36,6 +36,7 @@ from bms_estimator.checkpoint.arrays_file import (
     write_arrays,
 )
 from bms_estimator.checkpoint.run_file import PackDescription, RunFile, SavedRun
+from bms_estimator.kernels.kalman_filter.records import SCRATCH
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import CellModel, with_capacity
 from bms_estimator.model.errors import UserError
@@ -121,6 +122,8 @@ class CheckpointFile:
         disk = os.statvfs(self.path.parent)
         self.disk_free_mib = disk.f_bavail * disk.f_frsize / 2**20
         now, curves = self._now(), curves or {}
+        state = state.copy()
+        state["filter"][SCRATCH] = 0.0
         if not whole and self.path.exists() and self._changes.save(state, curves, now):
             return
         token = secrets.token_hex(8)
@@ -136,7 +139,7 @@ class CheckpointFile:
         content |= {f"{_CURVES}{name}": array for name, array in curves.items()}
         content |= {f"{_CELLS}{name}": array for name, array in (cells or {}).items()}
         write_arrays(self.path, content)
-        self._changes.set_base(BaseCheckpoint(token, state.copy(), curves, now))
+        self._changes.set_base(BaseCheckpoint(token, state, curves, now))
         self._remove_oldest()
 
     def load(self) -> PackState:

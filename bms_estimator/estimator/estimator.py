@@ -164,7 +164,7 @@ class Estimator:
         return float(self.state["soc"][0]) if self.state["started"][0] else math.nan
 
     @property
-    def soc_std(self) -> float:
+    def weakest_cell_soc_std(self) -> float:
         """Standard deviation of the weakest cell about ``soc``, which includes the imbalance; NaN without the identifier."""
         if not (self.has_filter and self.state["started"][0]):
             return math.nan

@@ -1,5 +1,33 @@
 """Settings and state records of the whole estimator.
 
+Each part of ESTIMATOR_STATE has an owner, which writes it. Other kernels write only the fields of the last column:
+
+=================  ================================  =======================================================================================
+part               owner                             fields that others write
+=================  ================================  =======================================================================================
+observer           observer.observer                 all with a learning law: learning_law; a, soc, target: identifier; counters, time: step
+pending            step                              -
+current_check      current_check                     -
+learning           observer.learning_law             settle_s: step; temperature_c: start
+series_resistance  observer.series_resistance        settle_s: step
+filter             kalman_filter                     current_a, step.phase, window, x_a, temperature_c: identifier, start, step
+elements           kalman_filter.equivalent_circuit  -
+checks             input_checks, frozen_sensor       outliers: current_check; slow_v, gated_*, mean_a, last_v: start, identifier
+counters           kalman_filter.input_checks        -
+anchors            kalman_filter.anchors             last, soc_before, soc_std_before, soc_after: identifier
+map, fit           kalman_filter.element_map         -
+history            accumulators.history              -
+fit_age_s          identifier                        -
+next_element       identifier                        -
+unlearned_s        identifier                        start
+unseen_s           ``Estimator.resume``              -
+=================  ================================  =======================================================================================
+
+Outside the kernels, only ``estimator`` writes fields. Exceptions: a worker of a fleet replaces the record and writes
+``history.enabled``; the simulation of the thesis sets ``observer.v_ts`` and ``v_tl``. Other states of a pack are not in the record:
+single cells (``estimator.cell_estimator``), rows and fits (``pack_model``), load (``forecast``), totals (``pack``), alarms
+(``telemetry.alarms``).
+
 (3.18) and (4.2) are equations of the thesis.
 """
 

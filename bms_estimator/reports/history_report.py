@@ -122,7 +122,7 @@ MAX_EVENTS = 100
 
 
 @dataclass(frozen=True)
-class PackHistory:
+class StoredHistory:
     """Stored history of a pack.
 
     Attributes:
@@ -147,7 +147,7 @@ class PackHistory:
     warnings: Sequence[str] = ()
 
 
-def history_report(history: PackHistory, written: str) -> ReportPage:
+def history_report(history: StoredHistory, written: str) -> ReportPage:
     """Return the report on a pack's history, which has at least one row."""
     begin, end = _utc(history.time_s[0]), _utc(history.time_s[-1])
     events = [_events(history.events)] if history.events else []
@@ -169,7 +169,7 @@ def history_report(history: PackHistory, written: str) -> ReportPage:
     )
 
 
-def _sentences(history: PackHistory) -> list[str]:
+def _sentences(history: StoredHistory) -> list[str]:
     """Return sentences on the SOC, the charge and the measured time of the pack."""
     columns = history.columns
     out_ah, in_ah = float(columns["charge_out_ah"].sum()), float(columns["charge_in_ah"].sum())
@@ -188,7 +188,7 @@ def _sentences(history: PackHistory) -> list[str]:
     return sentences
 
 
-def _over_time(history: PackHistory) -> Group:
+def _over_time(history: StoredHistory) -> Group:
     """Return the figures over time. A sentence replaces a figure without values."""
     figures, sentences = [], []
     for title, column, needed, draw in _FIGURES:
@@ -206,7 +206,7 @@ def _over_time(history: PackHistory) -> Group:
     return Group("Over time", tuple(figures), remark=" ".join(sentences))
 
 
-def _draw_soc(history: PackHistory, ax: Any) -> None:
+def _draw_soc(history: StoredHistory, ax: Any) -> None:
     soc, std = 100.0 * history.columns["soc"], 200.0 * np.nan_to_num(history.columns["soc_std"])
     time, middle, low, high = _with_gaps(history.time_s, soc, (soc - std).clip(0.0), (soc + std).clip(max=100.0))
     draw_band(ax, time, low, high)
@@ -216,10 +216,10 @@ def _draw_soc(history: PackHistory, ax: Any) -> None:
 
 def _draw_range(
     quantity: str, unit: str, label: str, min_span: float, color: str
-) -> Callable[[PackHistory, Any], None]:
+) -> Callable[[StoredHistory, Any], None]:
     """Return a function that draws the mean of a quantity with the band of its extremes, on an axis of at least ``min_span``."""
 
-    def draw(history: PackHistory, ax: Any) -> None:
+    def draw(history: StoredHistory, ax: Any) -> None:
         mean, low, high = (history.columns[f"{quantity}_{part}{unit}"] for part in ("", "min_", "max_"))
         time, mean, low, high = _with_gaps(history.time_s, mean, low, high)
         draw_band(ax, time, low, high, color=color)
@@ -231,7 +231,7 @@ def _draw_range(
     return draw
 
 
-def _marker(history: PackHistory) -> str:
+def _marker(history: StoredHistory) -> str:
     return "." if history.time_s.size <= MAX_MARKED_ROWS else ""
 
 
@@ -297,7 +297,7 @@ def _label_axes(ax: Any, label: str, min_span: float) -> None:
     widen(ax, min_span)
 
 
-def _learned(history: PackHistory) -> Group:
+def _learned(history: StoredHistory) -> Group:
     if not history.learned:
         return Group("Learned parameters", remark=history.not_learned)
     return Group(
@@ -315,7 +315,7 @@ def _events(events: Sequence[tuple[float, str, str]]) -> Group:
     return Group("Events and alarms", columns=("time", "event", "details"), rows=rows, is_text=True, remark=remark)
 
 
-def _quality(history: PackHistory) -> Group:
+def _quality(history: StoredHistory) -> Group:
     interval_s = np.diff(history.time_s)
     is_second_row = history.time_s % MINUTE_S != 0.0  # the first row of a minute has its start time
     gaps_s = interval_s[interval_s > MINUTE_S] - MINUTE_S
@@ -330,7 +330,7 @@ def _quality(history: PackHistory) -> Group:
     return Group("Data quality", columns=("", "in this history"), rows=rows, is_text=True)
 
 
-def _measured_fraction(history: PackHistory) -> float:
+def _measured_fraction(history: StoredHistory) -> float:
     duration_s = history.time_s[-1] + MINUTE_S - history.time_s[0]
     return min(float(history.columns["seen_s"].sum() / duration_s), 1.0)
 

@@ -13,6 +13,7 @@ from bms_estimator.model.arrays import Records
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.snapshot import CellFaultName, CellReport, CellsReport
 from bms_estimator.pack.pack import Pack
+from bms_estimator.pack_model.bank_comparison import ComparedCell
 from bms_estimator.telemetry.state import finite
 
 
@@ -37,38 +38,46 @@ def full_capacity_ah(estimator: Estimator) -> float:
 class WeakestCell(NamedTuple):
     """Estimate of the weakest cell."""
 
+    number: int | None
+    """Number of the cell, from 1; None if the bank's voltage does not tell which cell it is."""
     soc: float
     """SOC, 0..1."""
     std: float
     """Std of ``soc``."""
     capacity_ratio: float
     """Capacity relative to the other cells."""
+    by: CellDeviations | ComparedCell
+    """Estimate from the cell voltages, or from the bank's voltage, of which this is the result."""
+
+
+def weakest_by_cells(cells: CellDeviations) -> WeakestCell:
+    """Return the cell with the lowest SOC."""
+    i = cells.weakest
+    return WeakestCell(i + 1, cells.soc[i], cells.soc_std[i], cells.capacity_ratio[i], cells)
 
 
 def weakest_cell(pack: Pack) -> WeakestCell | None:
     """Return the present estimate of the weakest cell; None before the first one."""
-    estimator, cells = pack.estimator, pack.cells.deviations if pack.cells else None
-    if cells is not None:
-        i = cells.weakest
-        return WeakestCell(cells.soc[i], cells.soc_std[i], cells.capacity_ratio[i])
+    estimator = pack.estimator
+    if pack.cells and pack.cells.deviations is not None:
+        return weakest_by_cells(pack.cells.deviations)
     weakest = pack.slow_fit.bank.weakest if pack.slow_fit and pack.slow_fit.bank else None
     if weakest is None or math.isnan(estimator.soc):
         return None
     soc, std = weakest.weakest_soc(estimator.soc)
-    return WeakestCell(soc, math.hypot(std, estimator.record[0]["filter"]["soc_std"]), weakest.capacity_ratio)
+    soc_std = math.hypot(std, estimator.record[0]["filter"]["soc_std"])
+    return WeakestCell(None, soc, soc_std, weakest.capacity_ratio, weakest)
 
 
 def estimate_fields(pack: Pack) -> dict[str, Any]:
     """Return the fields of ``Estimate`` about single cells; empty before their first estimate."""
-    cell, cells = weakest_cell(pack), pack.cells.deviations if pack.cells else None
+    cell = weakest_cell(pack)
     if cell is None:
         return {}
     return {
-        "weakest_cell_soc": finite(cell.soc),
-        "weakest_cell_soc_std": finite(cell.std),
+        **weakest_cell_fields(cell),
         "weakest_cell_capacity": finite(cell.capacity_ratio),
         "usable_capacity_to_weakest_ah": finite(cell.soc * cell.capacity_ratio * full_capacity_ah(pack.estimator)),
-        **(weakest_cell_fields(cells) if cells else {}),
     }
 
 
@@ -178,15 +187,15 @@ def make_cells_payload(cells: CellDeviations, short_limit_a: float, now_s: float
     )
 
 
-def weakest_cell_fields(cells: CellDeviations) -> dict[str, float | int | None]:
-    """Return the fields of ``Estimate`` that summarize the estimates of the single cells."""
-    i = cells.weakest
+def weakest_cell_fields(cell: WeakestCell) -> dict[str, float | int | None]:
+    """Return the weakest cell and the spreads of the cells as fields of ``Estimate``; the spreads only by cell voltages."""
+    cells = cell.by
     return {
-        "weakest_cell": i + 1,
-        "weakest_cell_soc": finite(cells.soc[i]),
-        "weakest_cell_soc_std": finite(cells.soc_std[i]),
-        "cell_soc_spread": float(np.ptp(cells.soc_deviation)),
-        "cell_r_spread": float(np.ptp(cells.resistance_ratio)),
+        "weakest_cell": cell.number,
+        "weakest_cell_soc": finite(cell.soc),
+        "weakest_cell_soc_std": finite(cell.std),
+        "cell_soc_spread": float(np.ptp(cells.soc_deviation)) if isinstance(cells, CellDeviations) else None,
+        "cell_r_spread": float(np.ptp(cells.resistance_ratio)) if isinstance(cells, CellDeviations) else None,
     }
 
 
@@ -194,6 +203,6 @@ def cell_columns(cells: CellDeviations | None, count: int) -> Records:
     """Return the present values in ``count`` equal rows, dtype ``CELL_COLUMNS``; NaN without an estimate of the cells."""
     rows = np.full(count, math.nan).astype(CELL_COLUMNS)
     if cells is not None:
-        for name, value in weakest_cell_fields(cells).items():
+        for name, value in weakest_cell_fields(weakest_by_cells(cells)).items():
             rows[name] = math.nan if value is None else value
     return rows

@@ -7,6 +7,7 @@ import pytest
 
 from bms_estimator.estimator.estimator import SAMPLE_OUTCOMES, Estimator
 from bms_estimator.estimator.stability_conditions import failed_conditions, lemma_conditions
+from bms_estimator.kernels.kalman_filter.records import SCRATCH
 from bms_estimator.kernels.step import SampleOutcome
 from bms_estimator.model.arrays import SAMPLE, SampleBlock, SampleStatus
 from bms_estimator.model.cell import load_cell, shipped_cells
@@ -46,9 +47,24 @@ def test_soc_and_its_std_are_those_of_the_last_row(series: int) -> None:
     samples["voltage_v"] *= series
     estimator = Estimator(load_cell("ncr18650").pack(series, 1), initial_soc=0.8)
     assert math.isnan(estimator.soc)
-    assert math.isnan(estimator.soc_std)
+    assert math.isnan(estimator.weakest_cell_soc_std)
     last = estimator.run(samples)[-1]
-    assert (estimator.soc, estimator.soc_std) == (last["soc"], last["soc_std"])
+    assert (estimator.soc, estimator.weakest_cell_soc_std) == (last["soc"], last["soc_std"])
+
+
+def test_scratch_space_is_written_before_it_is_used() -> None:
+    samples = pulses(hours=0.3)[0]
+    samples["time_s"][300:] += 120.0
+    samples["time_s"][600:] += 2e4
+    saved, uninterrupted = (Estimator(load_cell("ncr18650"), initial_soc=0.7) for _ in range(2))
+    trace = uninterrupted.run(samples)
+    for j in range(0, samples.size, 20):
+        saved.record["filter"][SCRATCH] = np.nan
+        rows = saved.run(samples[j : j + 20])
+        assert rows.tobytes() == trace[j : j + 20].tobytes()
+    for estimator in (saved, uninterrupted):
+        estimator.record["filter"][SCRATCH] = 0.0
+    assert saved.record.tobytes() == uninterrupted.record.tobytes()
 
 
 def test_the_gain_of_the_observer_changes_no_estimate() -> None:
@@ -72,7 +88,7 @@ def test_the_gain_of_the_observer_changes_no_estimate() -> None:
 def test_soc_has_no_std_without_the_identifier() -> None:
     estimator = Estimator(load_cell("ncr18650"), initial_soc=0.8, identifier=None)
     estimator.run(noisy_load(200))
-    assert math.isnan(estimator.soc_std)
+    assert math.isnan(estimator.weakest_cell_soc_std)
 
 
 def test_a_restored_state_resumes_identically() -> None:

@@ -5,6 +5,7 @@ import numpy as np
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.fleet.worker.block_result import BlockResult
 from bms_estimator.fleet.worker.partition import Partition
+from bms_estimator.kernels.kalman_filter.records import SCRATCH
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.pack import PackSettings, Settings
@@ -36,8 +37,9 @@ def blocks_of(samples: SampleBlock, store: int = STORE_ID_NS, oldest: int = 1, s
 
 
 def estimates_of(record: np.ndarray) -> bytes:
-    """Return an estimator's record, shape (1,), without the rows of the history, which only packs with fits record."""
+    """Return an estimator's record, shape (1,), without scratch, and without the history, which only packs with fits record."""
     record = record.copy()
+    record["filter"][SCRATCH] = 0.0
     record["history"] = np.zeros((), record.dtype["history"])
     return record.tobytes()
 

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from bms_estimator.reports.history_report import PackHistory, history_report
+from bms_estimator.reports.history_report import StoredHistory, history_report
 from bms_estimator.reports.report_parts import AgingHistory, duration_text
 from bms_estimator.store.history import Minute
 
@@ -16,7 +16,7 @@ def history_of(time_s, **columns):
     """Return a history of minutes without events, whose columns are 60 unless given."""
     time_s = np.array(time_s)
     values = {name: np.full(time_s.size, columns.get(name, 60.0)) for name in Minute._fields} | {"time_s": time_s}
-    return PackHistory(
+    return StoredHistory(
         "shed", time_s, values, events=(), learned=(), not_learned="", aging=AgingHistory(None, "No fit.")
     )
 

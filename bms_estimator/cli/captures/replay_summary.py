@@ -13,7 +13,7 @@ from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.kernels.accumulators.soc_certainty import known_rows
 from bms_estimator.pack.pack import Pack
-from bms_estimator.telemetry.cells import CELL_COLUMNS, make_cells_payload, weakest_cell_fields
+from bms_estimator.telemetry.cells import CELL_COLUMNS, make_cells_payload, weakest_by_cells, weakest_cell_fields
 from bms_estimator.telemetry.health import sample_counters, suspicions
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.state import finite, known_margin, missing_margin_reason
@@ -222,7 +222,7 @@ def _last_cells(deviations: CellDeviations | None, short_limit_a: float) -> dict
     if deviations is None:
         return {**dict.fromkeys(CELL_COLUMNS.names or ()), "cells": []}
     report = make_cells_payload(deviations, short_limit_a, now_s=0.0)  # the time is not part of the result
-    return {**weakest_cell_fields(deviations), "cells": [cell.model_dump() for cell in report.cells]}
+    return {**weakest_cell_fields(weakest_by_cells(deviations)), "cells": [cell.model_dump() for cell in report.cells]}
 
 
 def _finite_field(row: np.void | None, name: str) -> float | None:

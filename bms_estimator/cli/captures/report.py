@@ -40,7 +40,7 @@ from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.saved import history_from_arrays
 from bms_estimator.process.state_folder import state_folder
 from bms_estimator.reports.capture_report import capture_report
-from bms_estimator.reports.history_report import PackHistory, history_report
+from bms_estimator.reports.history_report import StoredHistory, history_report
 from bms_estimator.reports.report_parts import AgingHistory, ReportPage, number
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.captures.replay import Capture, open_capture
@@ -52,7 +52,7 @@ CAPACITY = "capacity [Ah]"
 """Name of the learned capacity."""
 
 
-def pack_history(settings: Settings, model: PackModel, folder: Path | None, since_s: float) -> PackHistory:
+def pack_history(settings: Settings, model: PackModel, folder: Path | None, since_s: float) -> StoredHistory:
     """Return the history that the service of a pack has stored.
 
     Args:
@@ -85,7 +85,7 @@ def pack_history(settings: Settings, model: PackModel, folder: Path | None, sinc
     if aging.course:
         learned = [row for row in learned if row[0] != CAPACITY]  # the table of the slow fit has the capacity
     warnings = _implausible_voltages(model, columns["voltage_v"], path)
-    return PackHistory(settings.pack.name, columns["time_s"], columns, events, learned, not_learned, aging, warnings)
+    return StoredHistory(settings.pack.name, columns["time_s"], columns, events, learned, not_learned, aging, warnings)
 
 
 def _implausible_voltages(model: PackModel, voltage_v: Floats, path: Path) -> list[str]:

@@ -118,7 +118,7 @@ def _window_of_pack(settings: Settings, model: PackModel) -> tuple[Window, float
     saved = StateFiles(state_folder(settings), settings, model).saved_pack().pack
     history, fit = (saved.slow_fit.history, saved.slow_fit.saved_fit) if saved.slow_fit else (History(), None)
     window = window_of_history(history.rows, fit, has_temperature=bool(saved.estimator.record[0]["filter"]["sensed"]))
-    return window, saved.estimator.soc_std, int((history.rows["reference_kind"] == FULL).sum())
+    return window, saved.estimator.weakest_cell_soc_std, int((history.rows["reference_kind"] == FULL).sum())
 
 
 def _print(result: AccuracyResult) -> None:

@@ -211,7 +211,7 @@ def _result_table(
     table.add_column()
     estimator = start.pack.estimator
     rows = {
-        "SOC now": f"{estimator.soc:.1%} ± {2.0 * estimator.soc_std:.1%}",
+        "SOC now": f"{estimator.soc:.1%} ± {2.0 * estimator.weakest_cell_soc_std:.1%}",
         **_age_row(start.age_s),
         "load": load,
         f"time to {cutoff_v:.4g} V": _time_text(forecast),

@@ -18,6 +18,7 @@ from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
 from bms_estimator.kernels.alarms.records import ALARM, ALARMS
 from bms_estimator.kernels.cells.records import BANK_STATE, CELL
+from bms_estimator.kernels.kalman_filter.records import SCRATCH
 from bms_estimator.kernels.packed_record import WORD_BYTES, pack, packed_buffer, symmetry_map, unpack
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields
@@ -154,6 +155,7 @@ class UnpackedRecord:
         self._base_dtype = dtype
         self._set_cell_count(0)
         self.record: NDArray[np.void] = self._words.view(dtype)
+        self._scratch = [self.record["estimator"]["filter"][name] for name in SCRATCH] if dtype is PACK_STATE else []
 
     def _set_cell_count(self, cells: int) -> None:
         dtype = pack_dtype(cells) if cells else self._base_dtype
@@ -257,5 +259,7 @@ class UnpackedRecord:
         hour["lost_blocks"] = min(int(hour["lost_blocks"]) + blocks, MAX_LOST_BLOCKS)
 
     def packed_bytes(self) -> bytes:
-        """Return the packed record."""
+        """Return the packed record, without ``SCRATCH``."""
+        for array in self._scratch:
+            array.fill(0.0)
         return self._buffer[: pack(self._words, self._symmetric_words, self._buffer)].tobytes()

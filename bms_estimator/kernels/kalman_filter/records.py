@@ -219,11 +219,14 @@ EKF_STATE = np.dtype(
         ("voltage_v", "f8"),  # voltage predicted by the most likely hypothesis [V]
         ("innovation_v", "f8"),  # measured less predicted voltage [V]
         ("innovation_variance", "f8"),  # S [V^2]
-        ("ohm", "f8", RESISTANCES),  # scratch space: resistances [ohm]
-        ("h", "f8", STATES),  # scratch space: H
-        ("ph", "f8", STATES),  # scratch space: P H'
-        ("f", "f8", STATES),  # scratch space: diagonal of F over the window
+        ("ohm", "f8", RESISTANCES),  # SCRATCH: resistances [ohm]
+        ("h", "f8", STATES),  # SCRATCH: H
+        ("ph", "f8", STATES),  # SCRATCH: P H'
+        ("f", "f8", STATES),  # SCRATCH: diagonal of F over the window
     ],
     align=True,
 )
 """State of the Kalman filter."""
+
+SCRATCH = ["ohm", "h", "ph", "f"]
+"""Fields of EKF_STATE that are written before each use. Saved states have zeros instead."""

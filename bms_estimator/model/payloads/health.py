@@ -165,7 +165,7 @@ class Health(Payload):
         description="starts with a checkpoint of an earlier run"
     )
     reconnects: Annotated[int, Quantity(prometheus="counter")] = Field(
-        description="number of times that the source was reopened"
+        description="number of times that the source was connected again"
     )
     sensor_online: bool = Field(description="true: a valid sample arrived within three publish or sample periods")
     sensor_message: str | None = Field(description="reason why the sensor is offline; null while online")

@@ -14,7 +14,7 @@ export function drawHealth({ topics: { health: h, info, state } }) {
 	const tracking = e && `${state.lock ? "in" : "no"} lock, ${state.converged ? "converged" : "converging"}, e ${e}`;
 	const facts = {
 		Sensor: h.sensor_online ? "online" : "offline", "Sample rate": of(state?.sample_rate_hz, "Hz"), Frames: h.line?.frames_received,
-		"Frames lost": h.line?.frames_lost, "Wrong checksums": h.line?.crc_errors, "Line reopened": h.reconnects,
+		"Frames lost": h.line?.frames_lost, "Wrong checksums": h.line?.crc_errors, "Line connected again": h.reconnects,
 		"Latency, median": of(1e3 * h.loop?.latency_p50_s || null, "ms"), "Board's clock": of(h.clock_ppm, "ppm"), Broker: h.broker_trouble,
 		"Waiting for it": h.publish_waiting, Disk: h.store_trouble, Checkpoint: h.checkpoint, "Running for": f.duration(h.uptime_s),
 		Crashes: h.total?.crashes, Observer: tracking, "Observer, N(k)": f.digits(state?.nussbaum_gain, 3), "Observer, limits": f.deltas(state ?? {}), Version: info?.version,

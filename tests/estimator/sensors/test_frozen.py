@@ -42,7 +42,7 @@ def run(estimator: Estimator, samples: SampleBlock) -> tuple[np.ndarray, np.ndar
     results = []
     for n in range(samples.size):
         estimator.run(samples[n : n + 1])
-        results.append((estimator.soc, estimator.soc_std, estimator.record[0]["checks"]["suspects"]))
+        results.append((estimator.soc, estimator.weakest_cell_soc_std, estimator.record[0]["checks"]["suspects"]))
     soc, std, suspects = np.array(results).T
     return soc, std, suspects.astype(int)
 
