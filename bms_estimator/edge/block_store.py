@@ -64,7 +64,7 @@ class BlockStore:
 
     Attributes:
         connected: True if a broker is connected, as set by the sender.
-        dropped: Number of blocks lost since start, because the disk was full or damaged.
+        dropped: Number of blocks lost since start: disk or memory full, disk damaged, or a new store begun.
         resends: Number of accepted requests to send blocks again.
         progress: Progress in the stream ``TELEMETRY``, as stored.
     """
@@ -274,7 +274,7 @@ class BlockStore:
             entry.cursor = end
             self._unsent.pop(pack, None)  # the other packs are next
             self._update_unsent(pack)
-        elif end - first > 1:
+        elif end - first > 1:  # a page of one block may be a repeat, which lies before the cursor
             return
         if page.is_damaged:
             self._changed.add(pack)

@@ -61,7 +61,7 @@ def _available_in_parents(root: Path, path: str, limit_file: str, used: str) -> 
             with contextlib.suppress(OSError, ValueError):  # no such file, or the limit "max"
                 limit = int((folder / limit_file).read_text(encoding="ascii"))
                 statistics = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
-                yield limit - next(int(line.split()[1]) for line in statistics if line.startswith(f"{used} "))
+                yield limit - sum(int(line.split()[1]) for line in statistics if line.startswith(f"{used} "))
 
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")

@@ -1,7 +1,4 @@
-"""Runtime of a long-running process: log on stderr, signals, tasks and delays before retries, and sd_notify for systemd.
-
-Some libraries, and wait_for of Python 3.11, may swallow a cancellation.
-"""
+"""Runtime of a long-running process: log on stderr, signals, delays before retries, and ending of tasks."""
 
 import asyncio
 import contextlib
@@ -201,6 +198,7 @@ CANCEL_INTERVAL_S = 0.1
 async def end(*tasks: asyncio.Future[Any]) -> None:
     """Cancel tasks repeatedly until all have ended. They must not contain work that has to be finished.
 
+    Some libraries, and wait_for of Python 3.11, may swallow a cancellation.
     A cancellation of the caller takes effect afterwards, because unfinished tasks would run on without an owner.
     """
     cancellation: asyncio.CancelledError | None = None

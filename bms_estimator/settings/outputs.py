@@ -1,4 +1,4 @@
-"""Settings of the outputs of a service: brokers with their credentials, the page and the exports."""
+"""Settings of brokers with their credentials, of addresses to listen on, and of the outputs of a service: page and exports."""
 
 import ipaddress
 import re

@@ -94,7 +94,7 @@ class PublisherRecognition:
     def _sends_only_changes(self, publisher: Publisher) -> bool:
         """Return True if a retained voltage, current or cell voltage stayed silent, and no live value was repeated.
 
-        A silent temperature is no sign, because some publishers send temperatures less often than the other values.
+        A silent temperature, SOC or capacity is no sign, because some publishers send these less often than the other values.
         """
         live = self._live.get(publisher, {})
         repeated = any(a == b for payloads in live.values() for a, b in itertools.pairwise(payloads))

@@ -147,10 +147,13 @@ async def run_connected(
     """
     servers, creds, ca = address
     connecting = asyncio.ensure_future(connect(servers, name, creds=creds, ca=ca))
-    # a stop cancels only ``asyncio.wait``; therefore ``connecting`` is done only if there is a connection or an error
-    await until_first_ends(asyncio.wait([connecting]), stop.wait())
-    if not connecting.done():
-        await end(connecting)
+    try:
+        # a stop cancels only ``asyncio.wait``; therefore ``connecting`` is done only if there is a connection or an error
+        await until_first_ends(asyncio.wait([connecting]), stop.wait())
+    finally:
+        if not connecting.done():
+            await end(connecting)
+    if connecting.cancelled():
         return
     nc = connecting.result()
     try:

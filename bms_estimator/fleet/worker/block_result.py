@@ -122,12 +122,16 @@ class ResultPublisher:
         async with self._send_lock:
             while self.waiting:
                 messages = list(islice(self.waiting, MAX_PENDING))
-                await asyncio.gather(
-                    *(js.publish(each.subject, each.data, headers=dict(each.headers)) for each in messages)
+                outcomes = await asyncio.gather(
+                    *(js.publish(each.subject, each.data, headers=dict(each.headers)) for each in messages),
+                    return_exceptions=True,
                 )
-                for message in messages:  # the queue was cleared meanwhile if the ownership was lost
-                    if self.waiting and self.waiting[0] is message:
-                        self.waiting.popleft()
+                failed = [outcome for outcome in outcomes if isinstance(outcome, BaseException)]
+                pairs = zip(messages, outcomes, strict=True)
+                stored = {id(each) for each, outcome in pairs if not isinstance(outcome, BaseException)}
+                self.waiting = deque(each for each in self.waiting if id(each) not in stored)
+                if failed:
+                    raise failed[0]
 
     def add(self, result: BlockResult) -> None:
         """Add a result for ``publish_added``."""

@@ -124,7 +124,7 @@ class PeriodicStorage:
                 await self._try(lease, lease.results.send_queued)
 
     async def _try(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
-        """Run ``action``. After an error of connection or server, the next periodic call tries again."""
+        """Run ``action``. After an error of connection or server, the next call that is due tries again."""
         self.troubles.pop(lease.number, None)
         try:
             await action()

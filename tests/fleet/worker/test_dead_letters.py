@@ -10,8 +10,9 @@ import pytest
 from bms_estimator.edge import subjects
 from bms_estimator.edge.block import Block, encode
 from bms_estimator.estimator.estimator import make_estimator
+from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS
 from bms_estimator.fleet.nats.dead_letters import DeadLetter, read_dead_letters, replay_letter
-from bms_estimator.fleet.worker.block_result import LETHAL
+from bms_estimator.fleet.worker.block_result import LETHAL, BlockResult, ResultPublisher
 from bms_estimator.fleet.worker.worker import Options, work
 from tests.command_line import PROGRAM, run, running_program
 from tests.fleet.nats_cluster import NatsCluster
@@ -42,6 +43,18 @@ def lethal(pack: str, number: int) -> bytes:
     rows = samples(pack, number)
     rows["temperature_c"] = lethal_block.TEMPERATURE_C
     return encode(Block(store_created_ns=STORE_ID_NS, number=number, oldest=1, arrival_s=1.79e9, samples=rows))
+
+
+async def test_hourly_rows_are_stored_although_a_dead_letter_cannot_be_stored(nc) -> None:
+    js, results = nc.jetstream(), ResultPublisher(nc)
+    await js.delete_stream(subjects.DEAD_STREAM)
+    letter = DeadLetter("p1", 1, LETHAL, "w", b"")
+    results.queue_dead_letter(letter)
+    results.queue(BlockResult("p1", hours=(("p1-1", b"row"),)))
+    with pytest.raises(RETRYABLE_ERRORS):
+        await results.send_queued()
+    assert [each.subject for each in results.waiting] == [letter.subject]
+    assert (await js.stream_info(subjects.HOURS_STREAM)).state.messages == 1
 
 
 @pytest.mark.thorough
