@@ -83,7 +83,7 @@ def test_given_limits_of_the_current_bound_the_power(limit_a: float) -> None:
 
 @pytest.mark.parametrize(
     ("soc", "seconds", "names"),
-    [(0.1, 1, DISCHARGE), (0.2, 1, DISCHARGE), (0.8, 1, CHARGE), (0.9, 1, CHARGE), (0.9, 1800, CHARGE)],
+    [(0.3, 1, DISCHARGE), (0.46, 1, DISCHARGE), (0.3, 1, CHARGE), (0.7, 1, CHARGE), (0.9, 1800, CHARGE)],
 )
 def test_power_is_unknown_while_the_soc_is_too_uncertain(soc: float, seconds: int, names: tuple[str, str]) -> None:
     """The 5 % quantile would be 0 W, although the median is the power at the current limit.
