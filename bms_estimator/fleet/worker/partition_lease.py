@@ -66,6 +66,7 @@ class PartitionLease:
         claim: Claim of this worker; None while it has none.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
+        storage_troubles: Texts of the present errors of ``PeriodicStorage``, by kind of data.
         refused_format: Format of the last checkpoint if this worker cannot read it, and therefore refuses the partition;
             otherwise None.
     """
@@ -104,7 +105,7 @@ class PartitionLease:
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
         self.claim: Claim | None = None
-        self.trouble, self.checkpoint_due_s = "", 0.0
+        self.trouble, self.checkpoint_due_s, self.storage_troubles = "", 0.0, dict[str, str]()
         self.refused_format: int | None = None
         self._delivered = DeliveredMessages(
             self.consumer, self._guard, self.results, block_loop, self._process_next, self._try
@@ -229,10 +230,11 @@ class PartitionLease:
             )
 
     def drop(self) -> None:
-        """Drop state and claim, and add the events in the partition to the totals of the worker."""
+        """Drop state, claim and troubles, and add the events in the partition to the totals of the worker."""
         if self.partition:
             self.totals.events.update(self.partition.events)
         self.partition = self.claim = None
+        self.storage_troubles.clear()
 
     def on_settings_changed(self, pack: str) -> None:
         """Handle a changed or new row of the table of packs."""

@@ -1,6 +1,7 @@
 """Worker process, which processes its share of the partitions on one connection."""
 
 import asyncio
+import itertools
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -320,15 +321,15 @@ class Worker:
                     lease.on_settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
-        lease_trouble = next((lease.trouble for lease in self._leases if lease.trouble), "")
+        waiting = (lease.trouble for lease in self._leases if lease.trouble)
+        storage = (trouble for lease in self._leases for trouble in lease.storage_troubles.values())
         return self._report.make(
             self._leases,
             self._members.refused_partitions(),
             leaving=self._leaving,
             reconnects=self._nc.stats["reconnects"],
             checkpoint_s=self._storage.checkpoint_s,
-            trouble=lease_trouble
-            or next(iter(self._storage.troubles.values()), self._bucket.fault or self._unsaved.warning),
+            trouble=next(itertools.chain(waiting, storage), self._bucket.fault or self._unsaved.warning),
         )
 
 
