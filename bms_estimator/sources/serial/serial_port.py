@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 WRONG_PORT_RETRY_S = 60.0
 """Time until a port with another device is reopened while there are other ports [s]. Opening may reset that device."""
+SILENT_PORT_RETRY_S = 10.0
+"""Time until a silent port is reopened while there are other ports [s]. Its board may have been starting or without power."""
 BUSY_PORT_RETRY_S = 1.0
 """Time until a port that could not be opened is retried [s]. The search of another pack may have opened it."""
 

@@ -20,7 +20,13 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog, SilenceLog
 from bms_estimator.sources.serial.board_check import BoardCheck, OtherBoardError
 from bms_estimator.sources.serial.port_list import KnownBoardFile, NoPortError, open_port
-from bms_estimator.sources.serial.serial_port import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery, SerialPort
+from bms_estimator.sources.serial.serial_port import (
+    BUSY_PORT_RETRY_S,
+    SILENT_PORT_RETRY_S,
+    WRONG_PORT_RETRY_S,
+    PortDiscovery,
+    SerialPort,
+)
 from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 if TYPE_CHECKING:
@@ -179,14 +185,14 @@ class SerialSource:
         try:
             return self.board_check.accept(chunk, self._decoder)
         except OtherBoardError as error:
-            self._reject_device(f"{self._path}: refused: {error}")
+            self._reject_device(f"{self._path}: refused: {error}", WRONG_PORT_RETRY_S)
             return ()
 
-    def _reject_device(self, reason: str) -> None:
-        """Reject the device on the port and search elsewhere."""
+    def _reject_device(self, reason: str, retry_s: float) -> None:
+        """Reject the device on the port, and prefer other ports for ``retry_s``."""
         self._report(reason)
         self._rejected = True
-        self._discovery.skip_port(self._path, WRONG_PORT_RETRY_S)
+        self._discovery.skip_port(self._path, retry_s)
         self._port.lost.set()
 
     @property
@@ -317,17 +323,17 @@ class SerialSource:
             elif self._rejected:  # the reason is already reported
                 continue
             elif fault := self._current_decoder.fault:
-                self._report_or_reject(f"{path} at {self._settings.baud} baud: {fault}")
+                self._report_or_reject(f"{path} at {self._settings.baud} baud: {fault}", WRONG_PORT_RETRY_S)
             elif now_s - last_frame_s >= max(self._silence_limit_s, self._current_decoder.allowed_silence_s):
-                self._report_or_reject(f"{path}: open, but silent")
+                self._report_or_reject(f"{path}: open, but silent", SILENT_PORT_RETRY_S)
             self._fault_log.check(counters, now_s)
 
-    def _report_or_reject(self, reason: str) -> None:
-        """Report why no samples arrive. On a port that is not the preferred one, try other ports."""
+    def _report_or_reject(self, reason: str, retry_s: float) -> None:
+        """Report why no samples arrive. On a port that is not the preferred one, prefer other ports for ``retry_s``."""
         if self._discovery.is_preferred:
             self._report(reason)
         else:
-            self._reject_device(reason)
+            self._reject_device(reason, retry_s)
 
     async def _send_until_check(self) -> None:
         """Send due bytes until the next check, or until the port is lost."""
