@@ -217,7 +217,7 @@ class BlockStore:
             if changed or removed or (progress or self.progress) != self.progress:
                 await self._write(waiting, changed, removed, progress or self.progress)
         except BaseException as error:
-            self._changed |= changed
+            self._changed |= changed & self._packs.keys()  # without packs that were removed meanwhile
             self._removed |= removed
             if not isinstance(error, StoreError):
                 raise
@@ -250,14 +250,16 @@ class BlockStore:
             max_bytes=self._max_bytes,
         )
         after = await self._database.call(write)
-        del self._waiting[: len(waiting)]
+        # blocks that went into a store that was replaced meanwhile stay in memory, and are written to the new one
+        written = {id(block) for pack, block in waiting if self._packs.get(pack) is packs[pack]}
+        self._waiting = [each for each in self._waiting if id(each[1]) not in written]
         self.progress = progress
         if self._open_count != self._database.open_count:  # a damaged or deleted file was replaced by an empty one
             self._open_count = self._database.open_count
             self._changed.update(self._packs)
         for pack, position in after.items():
             entry = self._packs.get(pack)
-            if entry is packs[pack]:  # else a new store was begun meanwhile
+            if entry is packs[pack]:  # else the pack was removed, or a new store was begun meanwhile
                 self._count_lost(position.oldest - before[pack].oldest, "the store is full or damaged")
                 sent, oldest = max(position.sent, entry.position.sent), max(position.oldest, entry.position.oldest)
                 entry.position = position._replace(sent=sent, oldest=oldest)

@@ -6,6 +6,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+import threading
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from unittest import mock
@@ -145,6 +146,57 @@ async def test_oldest_blocks_of_a_pack_beyond_its_limit_are_dropped_and_those_of
         store.remove("b")
     async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         assert (store.packs, store.unconfirmed) == (["a"], 2)
+
+
+@contextlib.asynccontextmanager
+async def slow_sync(store: BlockStore) -> AsyncIterator[None]:
+    """Synchronize with a disk that does not write before the end of the context."""
+    is_ended = threading.Event()
+    store._database._thread.submit(is_ended.wait)
+    syncing = asyncio.create_task(store.sync())
+    await asyncio.sleep(0)  # until the sync waits for the disk
+    yield
+    is_ended.set()
+    assert await syncing
+
+
+async def test_removal_of_a_pack_during_a_write_loses_no_block_of_another_one(tmp_path: Path) -> None:
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+        removed, first, second = minute_blocks(3)
+        store.put("a", removed)
+        store.put("b", first)
+        async with slow_sync(store):
+            store.remove("a")
+            store.put("b", second)
+        await store.sync()
+        assert (store.packs, store.unconfirmed, store.dropped) == (["b"], 2, 0)
+        assert numbers(await take(store, 2, "b")) == [1, 2]
+
+
+async def test_blocks_that_are_written_while_a_new_store_is_begun_are_written_to_the_new_store(tmp_path: Path) -> None:
+    async with open_store(tmp_path / "s.sqlite") as store:
+        await write_blocks(store, *minute_blocks(2))
+        store.put(PACK, block_at(WALL_S + 120.0))
+        async with slow_sync(store):
+            store.on_request(PACK, BlockRequest(store=(int(WALL_S) + 9) * NS_PER_S, number=1, resend=False))
+        await store.sync()
+        assert (store.unconfirmed, store.dropped) == (1, 2)
+        (block,) = await take(store, 1)
+    assert (block.number, block.store_created_ns) == (1, (int(WALL_S) + 120) * NS_PER_S)
+
+
+async def test_pack_that_is_removed_during_a_failing_write_stays_removed(tmp_path: Path) -> None:
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+        store.put("a", block_at(WALL_S))
+
+        def fail(_: object) -> None:
+            store.remove("a")
+            raise StoreError("the disk has failed")
+
+        with mock.patch.object(store._database, "call", side_effect=fail):
+            assert not await store.sync()
+    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+        assert store.packs == []
 
 
 async def test_resend_of_a_pack_does_not_delay_the_others(tmp_path: Path) -> None:
