@@ -78,7 +78,7 @@ async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: Samp
             now_s = float(part["time_s"][-1])
             part["time_s"] -= START_S
             edge.take(part)
-        await until(lambda: edge.store.waiting == 0 and edge.store.unconfirmed, edge.health)
+        await until(lambda: edge.queue.waiting == 0 and edge.queue.unconfirmed, edge.health)
 
 
 async def test_states_of_packs_with_ingest_and_with_an_edge_are_equal(

@@ -1,4 +1,4 @@
-"""Block store of an edge: numbers, limits, and recovery after kills, damage and a full disk."""
+"""Block queue of an edge: numbers, limits, and recovery after kills, damage and a full disk."""
 
 import asyncio
 import contextlib
@@ -17,8 +17,8 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import Block, decode, encode
+from bms_estimator.edge.block_queue import BlockQueue
 from bms_estimator.edge.block_sender import PACK
-from bms_estimator.edge.block_store import BlockStore
 from bms_estimator.edge.block_table import EDGE_TABLES, INGEST_TABLES, NS_PER_S
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.model.arrays import SAMPLE
@@ -39,29 +39,29 @@ def block_at(at_s: float, count: int = 5) -> ReadyBlock:
 
 
 @contextlib.asynccontextmanager
-async def open_store(path: Path, tables: tuple[str, ...] = EDGE_TABLES, **limits: float) -> AsyncIterator[BlockStore]:
-    """Open the store of blocks at ``path`` with some limits."""
+async def open_queue(path: Path, tables: tuple[str, ...] = EDGE_TABLES, **limits: float) -> AsyncIterator[BlockQueue]:
+    """Open the queue of blocks at ``path`` with some limits."""
     async with Database(path, tables=tables, sync_s=0.0, retry_s=0.0) as database:
-        store = BlockStore(database, "raw/{}".format, **{"resend_s": 0.0} | limits)
+        store = BlockQueue(database, "raw/{}".format, **{"resend_s": 0.0} | limits)
         await store.sync()
         yield store
         await store.sync()
 
 
-async def write_blocks(store: BlockStore, *blocks: ReadyBlock, pack: str = PACK) -> None:
+async def write_blocks(store: BlockQueue, *blocks: ReadyBlock, pack: str = PACK) -> None:
     """Write blocks to disk."""
     for block in blocks:
         store.put(pack, block)
     assert await store.sync()
 
 
-async def fail_to_sync(store: BlockStore) -> None:
+async def fail_to_sync(store: BlockQueue) -> None:
     """Synchronize while the disk fails."""
     with mock.patch.object(store._database, "call", side_effect=StoreError("the disk has failed")):
         assert not await store.sync()
 
 
-async def take(store: BlockStore, count: int, pack: str = PACK) -> list[Block]:
+async def take(store: BlockQueue, count: int, pack: str = PACK) -> list[Block]:
     """Return the next ``count`` blocks of a pack to be sent, which the broker does not acknowledge."""
     blocks = list[Block]()
     async with asyncio.timeout(LONG_S):
@@ -72,7 +72,7 @@ async def take(store: BlockStore, count: int, pack: str = PACK) -> list[Block]:
     return blocks
 
 
-def acknowledge(store: BlockStore, *blocks: int) -> None:
+def acknowledge(store: BlockQueue, *blocks: int) -> None:
     """Acknowledge blocks in flight, by their numbers."""
     for message, (_, number) in list(store._in_flight.items()):
         if number in blocks:
@@ -89,7 +89,7 @@ def minute_blocks(count: int, first: int = 0) -> list[ReadyBlock]:
 
 
 async def test_blocks_are_taken_in_order_with_times_relative_to_the_store(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         ready = minute_blocks(4)
         await write_blocks(store, *ready)
         blocks = await take(store, 4)
@@ -104,14 +104,14 @@ async def test_blocks_are_taken_in_order_with_times_relative_to_the_store(tmp_pa
 async def test_restarted_edge_continues_numbers_and_time_of_the_store_and_sends_unacknowledged_blocks(
     tmp_path: Path,
 ) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(6))
         await take(store, 6)
         acknowledge(store, 1, 2, 3, 4)
         store.on_request(PACK, BlockRequest(store=int(WALL_S) * NS_PER_S, number=4, resend=False))
         assert (store.waiting, store.unconfirmed) == (2, 3)
         await fail_to_sync(store)
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         assert store.position(PACK).last_s == WALL_S + 304.0  # five samples from 300 s on
         await write_blocks(store, block_at(WALL_S))  # a clock set back does not set back the time of the store
         blocks = await take(store, 3)
@@ -122,7 +122,7 @@ async def test_restarted_edge_continues_numbers_and_time_of_the_store_and_sends_
 
 
 async def test_full_store_drops_its_oldest_blocks_and_announces_the_oldest_remaining_one(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite", max_bytes=60_000) as store:
+    async with open_queue(tmp_path / "s.sqlite", max_bytes=60_000) as store:
         with capture_logs() as lines:
             for i in range(400):
                 await write_blocks(store, block_at(WALL_S + 60.0 * i, count=50))
@@ -137,19 +137,19 @@ async def test_full_store_drops_its_oldest_blocks_and_announces_the_oldest_remai
 
 
 async def test_oldest_blocks_of_a_pack_beyond_its_limit_are_dropped_and_those_of_others_stay(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES, max_blocks=2) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES, max_blocks=2) as store:
         await write_blocks(store, *minute_blocks(2), pack="a")
         await write_blocks(store, *minute_blocks(5), pack="b")
         assert (store.unconfirmed_of("a"), store.unconfirmed_of("b"), store.dropped) == (2, 2, 3)
         assert numbers(await take(store, 2, "a")) == [1, 2]
         assert numbers(await take(store, 2, "b")) == [4, 5]
         store.remove("b")
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         assert (store.packs, store.unconfirmed) == (["a"], 2)
 
 
 @contextlib.asynccontextmanager
-async def slow_sync(store: BlockStore) -> AsyncIterator[None]:
+async def slow_sync(store: BlockQueue) -> AsyncIterator[None]:
     """Synchronize with a disk that does not write before the end of the context."""
     is_ended = threading.Event()
     store._database._thread.submit(is_ended.wait)
@@ -161,7 +161,7 @@ async def slow_sync(store: BlockStore) -> AsyncIterator[None]:
 
 
 async def test_removal_of_a_pack_during_a_write_loses_no_block_of_another_one(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         removed, first, second = minute_blocks(3)
         store.put("a", removed)
         store.put("b", first)
@@ -174,7 +174,7 @@ async def test_removal_of_a_pack_during_a_write_loses_no_block_of_another_one(tm
 
 
 async def test_blocks_that_are_written_while_a_new_store_is_begun_are_written_to_the_new_store(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(2))
         store.put(PACK, block_at(WALL_S + 120.0))
         async with slow_sync(store):
@@ -186,7 +186,7 @@ async def test_blocks_that_are_written_while_a_new_store_is_begun_are_written_to
 
 
 async def test_pack_that_is_removed_during_a_failing_write_stays_removed(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         store.put("a", block_at(WALL_S))
 
         def fail(_: object) -> None:
@@ -195,12 +195,12 @@ async def test_pack_that_is_removed_during_a_failing_write_stays_removed(tmp_pat
 
         with mock.patch.object(store._database, "call", side_effect=fail):
             assert not await store.sync()
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         assert store.packs == []
 
 
 async def test_resend_of_a_pack_does_not_delay_the_others(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         for pack in ("a", "b"):
             await write_blocks(store, *minute_blocks(4), pack=pack)
             await take(store, 4, pack)
@@ -214,7 +214,7 @@ async def test_resend_of_a_pack_does_not_delay_the_others(tmp_path: Path) -> Non
 
 
 async def test_transaction_whose_result_is_unknown_is_repeated_without_effect(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         call = store._database.call
 
         async def call_without_result(work: Callable[[sqlite3.Connection], object]) -> None:
@@ -229,7 +229,7 @@ async def test_transaction_whose_result_is_unknown_is_repeated_without_effect(tm
 
 
 async def test_blocks_that_the_broker_has_not_acknowledged_are_taken_again_after_a_rewind(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(6))
         await take(store, 5)
         acknowledge(store, 1, 2, 4)
@@ -238,7 +238,7 @@ async def test_blocks_that_the_broker_has_not_acknowledged_are_taken_again_after
 
 
 async def test_resend_request_repeats_the_requested_block_and_all_later_ones(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(8))
         await take(store, 8)
         store.on_request(PACK, BlockRequest(store=int(WALL_S) * NS_PER_S, number=3, resend=True))
@@ -247,7 +247,7 @@ async def test_resend_request_repeats_the_requested_block_and_all_later_ones(tmp
 
 
 async def test_repeated_resend_request_is_ignored_within_the_resend_interval(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         store._resend_s = LONG_S
         await write_blocks(store, *minute_blocks(8))
         await take(store, 8)
@@ -271,7 +271,7 @@ async def test_request_for_blocks_later_than_those_on_disk_begins_a_new_store(
     tmp_path: Path, block_request: BlockRequest
 ) -> None:
     """A disk restored from a backup has fewer blocks than the worker has received."""
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(3))
         await take(store, 3)
         with capture_logs() as lines:
@@ -291,7 +291,7 @@ async def test_request_for_blocks_later_than_those_on_disk_begins_a_new_store(
 
 @pytest.mark.parametrize("store_ns", [0, 5, (1 << 63) - 1])
 async def test_request_with_an_implausible_store_is_ignored(tmp_path: Path, store_ns: int) -> None:
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         await write_blocks(store, *minute_blocks(3))
         store.on_request(PACK, BlockRequest(store=store_ns, number=1 << 63, resend=True))
         await write_blocks(store, *minute_blocks(1, first=3))
@@ -309,7 +309,7 @@ async def test_unsent_blocks_of_an_edge_of_the_version_before_are_sent(tmp_path:
         migrate(connection, EDGE_TABLES[:1])
         connection.executemany("INSERT INTO block VALUES (?, ?)", [(number, encoded(number)) for number in (3, 4)])
         connection.execute("INSERT INTO store VALUES (?, 5, 184.0, 999, 'run', 4)", (int(WALL_S),))
-    async with open_store(tmp_path / "s.sqlite") as store:
+    async with open_queue(tmp_path / "s.sqlite") as store:
         await write_blocks(store, block_at(WALL_S))
         blocks = await take(store, 3)
     assert numbers(blocks) == [3, 4, 5]
@@ -330,7 +330,7 @@ async def test_unsent_blocks_and_progress_of_ingest_of_the_version_before_are_re
         ]
         connection.executemany("INSERT INTO pack VALUES (?, ?, ?, ?)", packs)
         connection.execute("INSERT INTO progress VALUES ('now', 77, 3)")  # three blocks were acknowledged
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         assert store.progress == ("now", 77)
         assert [store.unconfirmed_of(pack) for pack in store.packs] == [3, 1, 0]
         await write_blocks(store, block_at(WALL_S + 300.0), pack="b")
@@ -341,7 +341,7 @@ async def test_unsent_blocks_and_progress_of_ingest_of_the_version_before_are_re
 @pytest.mark.parametrize("damage", ["no database", "deleted", "other tables", "row"])
 async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "s.sqlite"
-    async with open_store(path) as store:
+    async with open_queue(path) as store:
         await write_blocks(store, *minute_blocks(3))
         created_s = store.position(PACK).created_s
         store.on_request(PACK, BlockRequest(store=created_s * NS_PER_S, number=3, resend=False))
@@ -354,7 +354,7 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
             connection.execute("DROP TABLE block" if damage == "other tables" else "UPDATE pack SET next = 'x'")
             connection.commit()
     with capture_logs() as lines:
-        async with open_store(path) as store:
+        async with open_queue(path) as store:
             await write_blocks(store, block_at(WALL_S + 500.0))
             (block,) = await take(store, 1)
             store.on_request(PACK, BlockRequest(store=block.store_created_ns, number=2, resend=False))
@@ -370,7 +370,7 @@ async def test_damaged_or_deleted_database_is_replaced_by_a_new_store(tmp_path: 
 
 
 async def test_file_deleted_while_in_use_loses_only_the_blocks_written_before(tmp_path: Path) -> None:
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         await write_blocks(store, *minute_blocks(3), pack="a")
         await write_blocks(store, *minute_blocks(1), pack="b")
         (tmp_path / "s.sqlite").unlink()
@@ -379,20 +379,20 @@ async def test_file_deleted_while_in_use_loses_only_the_blocks_written_before(tm
         assert (numbers(blocks), {block.oldest for block in blocks}) == ([4, 5], {4})
         assert store.dropped == 3
         await store.sync()
-    async with open_store(tmp_path / "s.sqlite", INGEST_TABLES) as store:
+    async with open_queue(tmp_path / "s.sqlite", INGEST_TABLES) as store:
         assert {pack: store.position(pack).next_number for pack in store.packs} == {"a": 6, "b": 2}
 
 
 async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
     path = tmp_path / "s.sqlite"
-    async with open_store(path) as store:
+    async with open_queue(path) as store:
         await write_blocks(store, *minute_blocks(6))
     with contextlib.closing(sqlite3.connect(path)) as connection:
         connection.execute("UPDATE block SET data = zeroblob(200) WHERE number = 1")
         connection.execute("UPDATE block SET data = substr(data, 1, 60) WHERE number = 4")
         connection.execute("DELETE FROM block WHERE number = 5")
         connection.commit()
-    async with open_store(path) as store:
+    async with open_queue(path) as store:
         blocks = await take(store, 3)
         assert numbers(blocks) == [2, 3, 6]
         assert {block.oldest for block in blocks} == {2}  # block 2 is not yet confirmed and can be sent again
@@ -406,7 +406,7 @@ async def test_damaged_blocks_are_skipped(tmp_path: Path) -> None:
 
 
 async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(full_disk: Path) -> None:
-    async with open_store(full_disk / "s.sqlite") as store:
+    async with open_queue(full_disk / "s.sqlite") as store:
         for block in minute_blocks(3):
             store.put(PACK, block)
         assert not await store.sync()
@@ -419,7 +419,7 @@ async def test_blocks_wait_in_memory_without_a_number_while_the_disk_is_full(ful
 
 async def test_memory_is_bounded_while_the_disk_fails(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("a file in place of the folder")
-    async with open_store(tmp_path / "file" / "s.sqlite", max_waiting=500_000) as store:
+    async with open_queue(tmp_path / "file" / "s.sqlite", max_unwritten=500_000) as store:
         for i in range(60):
             store.put(PACK, block_at(WALL_S + 60.0 * i, count=20_000))
         assert not await store.sync()
@@ -429,9 +429,9 @@ async def test_memory_is_bounded_while_the_disk_fails(tmp_path: Path) -> None:
 WRITER_SCRIPT = """
 import asyncio, sys
 from pathlib import Path
-from tests.edge.test_block_store import minute_blocks, open_store, write_blocks
+from tests.edge.test_block_queue import minute_blocks, open_queue, write_blocks
 async def main():
-    async with open_store(Path(sys.argv[1])) as store:
+    async with open_queue(Path(sys.argv[1])) as store:
         for block in minute_blocks(10_000):
             await write_blocks(store, block)
             print(store.position('').next_number, file=sys.stderr, flush=True)
@@ -455,7 +455,7 @@ async def test_killed_edge_never_uses_a_block_number_twice(tmp_path: Path) -> No
     for _ in range(3):
         reported = await asyncio.to_thread(kill_while_writing, path)
         assert reported >= next_number + 20
-        async with open_store(path) as store:
+        async with open_queue(path) as store:
             next_number = store.position(PACK).next_number
             assert next_number >= reported
             assert numbers(await take(store, store.unconfirmed)) == list(range(1, next_number))
