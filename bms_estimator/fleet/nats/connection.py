@@ -6,8 +6,9 @@ import logging
 import re
 import ssl
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
+from typing import Any
 
 import nats.aio.client
 import nats.errors
@@ -131,22 +132,19 @@ async def connect(
 async def run_connected(
     run: Callable[[Client], Awaitable[None]],
     stop: asyncio.Event,
-    name: str,
-    address: tuple[str, Path | None, Path | None],
+    connection: Coroutine[Any, Any, Client],
 ) -> None:
     """Connect, run a service, and close the connection. If ``stop`` is set before a server is found, nothing is run.
 
     Args:
         run: Runs the service until ``stop`` is set.
         stop: Event that ends the service.
-        name: Name of the connection.
-        address: Arguments ``servers``, ``creds`` and ``ca`` of ``connect``.
+        connection: Call of ``connect``.
 
     Raises:
         UserError: The address cannot be used.
     """
-    servers, creds, ca = address
-    connecting = asyncio.ensure_future(connect(servers, name, creds=creds, ca=ca))
+    connecting = asyncio.ensure_future(connection)
     try:
         # a stop cancels only ``asyncio.wait``; therefore ``connecting`` is done only if there is a connection or an error
         await until_first_ends(asyncio.wait([connecting]), stop.wait())

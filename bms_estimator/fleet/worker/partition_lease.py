@@ -30,7 +30,8 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointSto
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer, RawMessages
+from bms_estimator.fleet.worker.partition_reader import PartitionReader
+from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 from bms_estimator.fleet.worker.takeover import ReplayGuard, restore_partition
 
@@ -89,7 +90,7 @@ class PartitionLease:
         self.number, self._table, self._sources = number, table, sources
         self._checkpoints, self._checkpoint_format, self._block_loop = checkpoints, checkpoint_format, block_loop
         self.totals = totals
-        self._js, self._messages, self._is_busy = nc.jetstream(), RawMessages(nc, number), is_busy
+        self._js, self._messages, self._is_busy = nc.jetstream(), PartitionReader(nc, number), is_busy
         self._guard = ReplayGuard(checkpoints.replays, number)
         self.results = ResultPublisher(nc)
         self.runner = BlockRunner(
@@ -163,10 +164,10 @@ class PartitionLease:
                 await self._try(self._read_undelivered)
             elif self._are_changes_due:
                 self._are_changes_due = False
-                with delivered.served():
+                with delivered.processed_by_loop():
                     await self._try(self._send_table_changes)
             elif (partition := self.partition) and (due := partition.deferred.next(self._is_due)):
-                with delivered.served():
+                with delivered.processed_by_loop():
                     if not await self._try(partial(self._process_deferred, partition, *due)):
                         await asyncio.sleep(RETRY_S)
             else:

@@ -122,4 +122,4 @@ async def _publish(nc, total_bytes: int) -> None:
 async def test_service_that_is_stopped_before_a_server_is_found_ends() -> None:
     stop = asyncio.Event()
     asyncio.get_running_loop().call_soon(stop.set)
-    await asyncio.wait_for(run_connected(close, stop, "w", ("nats://127.0.0.1:1", None, None)), LONG_S)
+    await asyncio.wait_for(run_connected(close, stop, connect("nats://127.0.0.1:1", "w")), LONG_S)
