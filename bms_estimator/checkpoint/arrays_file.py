@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from bms_estimator.checkpoint.run_file import CHECKSUM_BYTES, add_checksum, verify_checksum
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.pack_model import PackModel
-from bms_estimator.process.host import BootTimestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp
 from bms_estimator.process.state_folder import UnsafeFileError, read_private, write_private
 from bms_estimator.settings.pack import Settings
 

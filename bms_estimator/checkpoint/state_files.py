@@ -52,7 +52,7 @@ from bms_estimator.pack.state import (
     DeclaredValues,
     PackState,
 )
-from bms_estimator.process.host import BootTimestamp, boot_timestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp, boot_timestamp
 from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.settings.pack import Settings
 

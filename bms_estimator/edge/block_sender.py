@@ -26,7 +26,7 @@ from bms_estimator.model.payloads.health import EdgeHealth
 from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, DeliveryStats, brokers, check
 from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
-from bms_estimator.process.runtime import FIRST_DELAY_S, end, finish
+from bms_estimator.process.runtime import FIRST_DELAY_S, end_tasks, finish
 from bms_estimator.settings.outputs import EdgeSettings
 from bms_estimator.store.database import RETRY_S as DISK_RETRY_S
 from bms_estimator.store.database import Database
@@ -166,7 +166,7 @@ class BlockSender:
         linking, syncing = self._tasks
         await finish(linking, self._final_send_timeout_s + DISCONNECT_TIMEOUT_S)
         self._database.begin_shutdown()
-        await end(syncing)
+        await end_tasks(syncing)
         await self.queue.sync()
         await self._database.__aexit__()
 

@@ -135,7 +135,7 @@ def exit_on_startup_signals() -> Iterator[None]:
     An ignored SIGHUP stays ignored, as under nohup.
     """
     unignored = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
-    previous_handlers = {number: signal.signal(number, _end) for number in unignored}
+    previous_handlers = {number: signal.signal(number, _exit_process) for number in unignored}
     try:
         yield
     finally:
@@ -143,25 +143,20 @@ def exit_on_startup_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _end(*_: object) -> None:
+def _exit_process(*_: object) -> None:
     """End the process without an exception, because an exception may be lost in numba's compiler.
 
     The exit runs in a thread, because the interrupted code may hold the lock of the log.
     """
 
-    def end() -> None:
+    def exit_process() -> None:
         log.info("asked to end before samples were taken")
         stderr.drain()
         os._exit(0)
 
-    threading.Thread(target=end, daemon=True).start()
+    threading.Thread(target=exit_process, daemon=True).start()
 
 
-FIRST_RETRY_S = 0.5
-"""First retry delay of a missing or lost port; it doubles with each attempt [s]."""
-
-MAX_RETRY_S = 10.0
-"""Maximum retry delay of a missing or lost port [s]."""
 FIRST_DELAY_S = 2.0
 """First delay of a ``Backoff``; it doubles with each attempt [s]."""
 MAX_DELAY_S = 30.0
@@ -195,7 +190,7 @@ CANCEL_INTERVAL_S = 0.1
 """Interval at which a task that ignores cancellation is cancelled again [s]."""
 
 
-async def end(*tasks: asyncio.Future[Any]) -> None:
+async def end_tasks(*tasks: asyncio.Future[Any]) -> None:
     """Cancel tasks repeatedly until all have ended. They must not contain work that has to be finished.
 
     Some libraries, and wait_for of Python 3.11, may swallow a cancellation.
@@ -228,7 +223,7 @@ async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        await end(*tasks)
+        await end_tasks(*tasks)
     for task in tasks:
         if not task.cancelled() and (error := task.exception()):
             raise error

@@ -13,7 +13,7 @@ from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.pack_model import PackModel, load_model
-from bms_estimator.process.host import BootTimestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp
 from bms_estimator.settings.pack import Settings
 
 CHECKPOINT_FILE = Path(__file__).with_name("checkpoint_format_7.npz")

@@ -24,7 +24,7 @@ from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection, select_new
 from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, last_sample_s
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.store.database import Database
 
 MAX_PACK_BLOCKS = 10_080
@@ -89,7 +89,7 @@ class IngestStore:
     ) -> None:
         """Close the database."""
         if self._task is not None:
-            await end(self._task)
+            await end_tasks(self._task)
         await self._database.__aexit__()
 
     def last_s(self, pack: str) -> float:

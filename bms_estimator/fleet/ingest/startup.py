@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.streams import make_telemetry_stream, partitions_o
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.runtime import end, until_first_ends
+from bms_estimator.process.runtime import end_tasks, until_first_ends
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 NAME = "ingest"
@@ -65,7 +65,7 @@ async def open_ingest(
         starting = asyncio.ensure_future(_start(options))
         await until_first_ends(asyncio.wait([starting]), stop.wait())
         if not starting.done():
-            await end(starting)
+            await end_tasks(starting)
             yield None
             return
         nc, partitions, bucket = starting.result()

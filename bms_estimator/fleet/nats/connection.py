@@ -19,7 +19,7 @@ from nats.aio.transport import TcpTransport
 
 from bms_estimator.fleet.nats.stream_reader import StreamError
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.runtime import end, until_first_ends
+from bms_estimator.process.runtime import end_tasks, until_first_ends
 
 _TEXT_BY_CLASS: dict[type[BaseException], str] = {
     nats.js.errors.NotFoundError: "a stream is missing on the server: create it with `bms-estimator fleet serve`",
@@ -150,7 +150,7 @@ async def run_connected(
         await until_first_ends(asyncio.wait([connecting]), stop.wait())
     finally:
         if not connecting.done():
-            await end(connecting)
+            await end_tasks(connecting)
     if connecting.cancelled():
         return
     nc = connecting.result()

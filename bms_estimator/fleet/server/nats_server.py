@@ -29,7 +29,7 @@ from bms_estimator.fleet.server.node_watch import NodeWatch
 from bms_estimator.fleet.server.tenant_streams import make_all_streams
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.child_process import find_server, terminate_with_parent
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.settings.fleet import FleetSettings
 
 OTHER_FILES = 1000
@@ -118,7 +118,7 @@ async def _serve_until_restart(
             code = await ended
             is_restart = needs_restart.done() and not end_requested.is_set()
         finally:
-            await end(streams_ready, supervising, needs_restart)
+            await end_tasks(streams_ready, supervising, needs_restart)
         if is_restart:
             return None
         return 0 if end_requested.is_set() else code

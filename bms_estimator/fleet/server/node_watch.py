@@ -12,7 +12,7 @@ from bms_estimator.fleet.server.nats_config import Node
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, node_config
 from bms_estimator.fleet.server.tenant_streams import makes_streams
 from bms_estimator.fleet.server.tenant_watch import TenantWatch
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 
 
 class NodeWatch:
@@ -31,11 +31,11 @@ class NodeWatch:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await end(*self._tasks)
+        await end_tasks(*self._tasks)
 
     async def follow(self, spec: ServerSpec) -> None:
         """Watch the tenants of these settings instead of the former ones."""
-        await end(*self._tasks)
+        await end_tasks(*self._tasks)
         node, keys = node_config(self._location, spec), self._location.keys
         names = spec.settings.tenants_or_default if makes_streams(self._location, node) else ()
         self._tenants = {

@@ -15,7 +15,7 @@ from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 
 log = structlog.get_logger(__name__)
 
@@ -77,7 +77,7 @@ class LeaseTasks:
                 task.result()
 
     async def _release(self, number: int) -> None:
-        await end(self._tasks[number])
+        await end_tasks(self._tasks[number])
         async with self._release_slots:
             if self._is_connected():
                 await self._leases[number].release()

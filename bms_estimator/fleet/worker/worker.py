@@ -29,7 +29,7 @@ from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
 from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.runtime import end, until_first_ends
+from bms_estimator.process.runtime import end_tasks, until_first_ends
 from bms_estimator.process.systemd import SystemdNotifier
 
 
@@ -109,7 +109,7 @@ async def work(options: Options, stop: asyncio.Event) -> None:
     # a stop cancels only ``asyncio.wait``; therefore ``starting`` is done only if the worker was created
     await until_first_ends(asyncio.wait([starting]), stop.wait())
     if not starting.done():
-        await end(starting)
+        await end_tasks(starting)
         return
     worker = starting.result()
     try:
@@ -207,7 +207,7 @@ class Worker:
         # a pin expires without requests: continue them until each consumer is released
         renewing = asyncio.ensure_future(_repeat(RENEW_S, self._send_requests))
         await self._lease_tasks.release_all()
-        await end(renewing)
+        await end_tasks(renewing)
         await close(self._nc)
 
     @property

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 import structlog
 
 from bms_estimator.model.clock import since_boot
-from bms_estimator.process.runtime import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.sources.serial.port_list import NoPortError, PortBusyError, board_ports, resolve_port
-from bms_estimator.sources.source import Chunk
+from bms_estimator.sources.source import FIRST_RETRY_S, MAX_RETRY_S, Chunk
 
 if TYPE_CHECKING:
     import serial

@@ -12,7 +12,6 @@ import structlog
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.runtime import FIRST_RETRY_S
 from bms_estimator.protocols.base.reading_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.registry import make_protocol
@@ -27,7 +26,7 @@ from bms_estimator.sources.serial.serial_port import (
     PortDiscovery,
     SerialPort,
 )
-from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
+from bms_estimator.sources.source import FIRST_RETRY_S, Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 if TYPE_CHECKING:
     import serial

@@ -12,7 +12,7 @@ from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.worker.block_result import LETHAL
 from bms_estimator.fleet.worker.worker import Options, Worker, open_stores
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.process.systemd import SystemdNotifier
 from tests.fleet.nats_cluster import NatsCluster
 from tests.fleet.workers import Heartbeats, block, load_packs, send
@@ -28,7 +28,7 @@ async def worker(cluster: NatsCluster, nc: Client, heartbeats: Heartbeats) -> As
     worker = Worker(worker_nc, Options(cluster.url, "w"), await open_stores(worker_nc, "w"), SystemdNotifier(["w"]))
     running = asyncio.create_task(worker.run())
     await heartbeats.until(lambda last: "w" in last and last["w"].counters.get("blocks") == 1)
-    await end(running)
+    await end_tasks(running)
     await nc.jetstream().delete_stream(f"KV_{subjects.CHECKPOINTS_BUCKET}")
     (lease,) = worker._leases
     lease.checkpoint_due_s = 0.0

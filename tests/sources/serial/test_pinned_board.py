@@ -19,7 +19,7 @@ from structlog.testing import capture_logs
 
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.clock import since_boot
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.protocols.firmware.messages import MessageType
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
@@ -233,7 +233,7 @@ async def test_board_that_started_after_its_port_was_opened_is_found_before_othe
                 starting = asyncio.create_task(late.run())
                 now_s += SILENT_PORT_RETRY_S
                 await until(lambda: reader.blocks)
-                await end(starting)
+                await end_tasks(starting)
 
 
 async def test_changed_calibration_is_reported_before_it_is_stored(
