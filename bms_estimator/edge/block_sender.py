@@ -27,7 +27,7 @@ from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, D
 from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import FIRST_DELAY_S, end_tasks, finish
-from bms_estimator.settings.outputs import EdgeSettings
+from bms_estimator.settings.connections import EdgeSettings
 from bms_estimator.store.database import RETRY_S as DISK_RETRY_S
 from bms_estimator.store.database import Database
 

@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Times = NDArray[np.float64]
+from bms_estimator.model.arrays import Floats
 
 DEAD_BAND_S = 1.0
 """Maximum difference between the source's clock and the host's that is not corrected [s], because transport delays vary
@@ -51,11 +50,11 @@ class SampleClock:
         if time_s > self._last_s:
             self._last_s, self._lead_s, self._source_s = time_s, math.nan, math.nan
 
-    def place(self, source_s: Times, wall_s: float, steady_s: float) -> Times:
+    def place(self, source_s: Floats, wall_s: float, steady_s: float) -> Floats:
         """Return timestamps of samples that have just arrived [s since 1970].
 
         Args:
-            source_s: Times of the source's clock [s], shape (n,). A non-finite time is replaced by the previous one.
+            source_s: Floats of the source's clock [s], shape (n,). A non-finite time is replaced by the previous one.
             wall_s: Wall clock now [s since 1970].
             steady_s: Monotonic clock that continues during suspend [s].
         """
@@ -73,7 +72,7 @@ class SampleClock:
             self._source_s = math.nan
         return steady_s + self._lead_s
 
-    def _place(self, source_s: Times, now_s: float) -> Times:
+    def _place(self, source_s: Floats, now_s: float) -> Floats:
         """Return timestamps of samples between which the source's clock does not step back."""
         delay_s = now_s - (float(source_s[-1]) + self._offset_s)
         # the first comparison is also false for the first samples, when _source_s is NaN
@@ -92,7 +91,7 @@ class SampleClock:
         self._source_s, self._last_s = float(source_s[-1]), float(placed[-1])
         return placed
 
-    def _reset_mapping(self, source_s: Times, now_s: float) -> None:
+    def _reset_mapping(self, source_s: Floats, now_s: float) -> None:
         """Map the last sample to now, unless the first one would then precede an earlier sample."""
         offset_s = max(now_s - float(source_s[-1]), self._last_s - float(source_s[0]))
         self._offset_s, self._slew_s = math.ceil(offset_s * GRID) / GRID, 0.0
@@ -116,7 +115,7 @@ class SampleClock:
             self._slew_s = behind_s
 
 
-def _fill_non_finite(source_s: Times, previous_s: float) -> Times:
+def _fill_non_finite(source_s: Floats, previous_s: float) -> Floats:
     """Replace each non-finite time by the previous time, or by 0 at the start."""
     if np.isfinite(source_s).all():
         return source_s

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Coroutine, Iterator, MutableMapping, MutableSequence
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import structlog
 from structlog.processors import ExceptionRenderer
@@ -17,6 +17,7 @@ from structlog.tracebacks import ExceptionDictTransformer
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.settings.pack import LogLevel
 
+Result = TypeVar("Result")
 LEVELS: tuple[LogLevel, ...] = get_args(LogLevel)
 _levels: dict[str, LogLevel] = {}
 """Log levels by pack."""
@@ -215,6 +216,17 @@ async def finish(task: asyncio.Task[None], timeout_s: float) -> None:
         task.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await task
+
+
+async def result_before(stop: asyncio.Event, coroutine: Coroutine[Any, Any, Result]) -> Result | None:
+    """Return the result of a coroutine; None if ``stop`` is set before, which cancels it."""
+    task = asyncio.ensure_future(coroutine)
+    try:
+        # a stop cancels only ``asyncio.wait``; therefore the task is done only if it has a result or an error
+        await until_first_ends(asyncio.wait([task]), stop.wait())
+    finally:
+        await end_tasks(task)
+    return None if task.cancelled() else task.result()
 
 
 async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:

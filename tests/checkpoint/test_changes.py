@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.arrays_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_BASE_AGE_S, MAX_SOC_CHANGE
+from bms_estimator.checkpoint.changes_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_BASE_AGE_S, MAX_SOC_CHANGE
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.restore import restore_state

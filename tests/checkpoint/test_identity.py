@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.arrays_file import observer_identity, pack_identity
+from bms_estimator.checkpoint.identity import observer_identity, pack_identity
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.fleet.packs.pack_type import config_digest
 from bms_estimator.kernels.records import ESTIMATOR_STATE

@@ -14,7 +14,7 @@ from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.health import EdgeHealth
-from bms_estimator.settings.outputs import EdgeSettings
+from bms_estimator.settings.connections import EdgeSettings
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.mosquitto import Broker, Listener

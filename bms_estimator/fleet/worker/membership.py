@@ -29,16 +29,15 @@ def assign_partitions(partitions: int, workers: Mapping[str, Collection[int]]) -
     for number in range(partitions):
         candidates = [worker for worker, refused in workers.items() if number not in refused]
         below_fair_share = [worker for worker in candidates if counts[worker] < max_partitions]
-        weights = {worker: _weight(number, worker) for worker in below_fair_share or candidates}
+        weights = {
+            worker: blake2b(f"{number} {worker}".encode(), digest_size=8).digest()
+            for worker in below_fair_share or candidates
+        }
         owner = max(weights, key=lambda worker: (weights[worker], worker), default=None)
         if owner is not None:
             counts[owner] += 1
         owners.append(owner)
     return owners
-
-
-def _weight(partition: int, worker: str) -> bytes:
-    return blake2b(f"{partition} {worker}".encode(), digest_size=8).digest()
 
 
 class Membership:

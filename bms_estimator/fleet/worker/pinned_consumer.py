@@ -60,8 +60,7 @@ class PinnedConsumer:
         self._info_subject = f"$JS.API.CONSUMER.INFO.{subjects.RAW_STREAM}.{consumer(partition)}"
         self._unpin_subject = f"$JS.API.CONSUMER.UNPIN.{subjects.RAW_STREAM}.{consumer(partition)}"
         self.waiting: deque[DeliveredMessage] = deque()
-        self._pin = ""
-        self._pin_count = 0
+        self._pin, self._pin_count = "", 0
         self._last_consumer_sequence = -1  # of the last message; initially a value that no message follows
         self._popped_since_request = 0  # number of messages
 

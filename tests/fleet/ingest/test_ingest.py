@@ -29,7 +29,7 @@ from bms_estimator.fleet.packs.pack_bucket import remove_keys
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.clock import Clock
-from bms_estimator.settings.outputs import EdgeSettings
+from bms_estimator.settings.connections import EdgeSettings
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 from tests.fleet.ingest.platform import (
     START_S,
