@@ -8,8 +8,8 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import FULL_SOC
 from bms_estimator.calibration.cleaning.clean_capture import remove_glitches
-from bms_estimator.calibration.elements.initial_elements import curve as generic_curve
 from bms_estimator.calibration.elements.initial_elements import (
+    curve as generic_curve,
     initial_elements,
     nearest_generic_cell,
     scaled_generic_ladder,

@@ -28,8 +28,7 @@ from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import FIRST_DELAY_S, end_tasks, finish
 from bms_estimator.settings.connections import EdgeSettings
-from bms_estimator.store.database import RETRY_S as DISK_RETRY_S
-from bms_estimator.store.database import Database
+from bms_estimator.store.database import RETRY_S as DISK_RETRY_S, Database
 
 MIB = 1 << 20
 PACK = ""

@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.edge.sample_clock import DEAD_BAND_S, GRID, SLEW, STEP_S, WINDOW_S, SampleClock
 

@@ -17,8 +17,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
-from bms_estimator.fleet.ingest import ingest as ingest_module
-from bms_estimator.fleet.ingest import telemetry_reader
+from bms_estimator.fleet.ingest import ingest as ingest_module, telemetry_reader
 from bms_estimator.fleet.ingest.batch_reports import BatchReport
 from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection
 from bms_estimator.fleet.ingest.ingest_store import FILE, IngestStore

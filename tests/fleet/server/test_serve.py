@@ -23,8 +23,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import NoAnswerError
 from bms_estimator.fleet.server import credentials, nats_server, tenant_watch
 from bms_estimator.fleet.server.jwt_claims import Role
-from bms_estimator.fleet.server.nats_server import serve as serve_node
-from bms_estimator.fleet.server.nats_server import warn_of_open_file_limit
+from bms_estimator.fleet.server.nats_server import serve as serve_node, warn_of_open_file_limit
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError

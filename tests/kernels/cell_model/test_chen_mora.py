@@ -6,8 +6,7 @@ a10).
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.integrate import solve_ivp
 
 from bms_estimator.estimator.settings_records import ocv_grid
