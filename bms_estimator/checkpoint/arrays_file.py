@@ -1,11 +1,4 @@
-"""Files of a pack's arrays, saved beside its checkpoint: the history with its last fit, and the observed load.
-
-Hashes of settings and cell data identify the pack to which a file belongs.
-
-Changes of the estimator's state since its checkpoint are in two files of one disk block each, which are written in turn.
-Frequent saves thus wear an SD card little: overwriting a block changes neither the folder nor the file's length. A power
-failure damages at most the block that is being written, and the other one has the state before it.
-"""
+"""Files of a pack's arrays, saved beside its checkpoint: the history with its last fit, and the observed load."""
 
 import contextlib
 import io

@@ -34,6 +34,7 @@ MAX_STD_RATIO = 1.1
 """Maximum growth of the SOC's std since the checkpoint. A restart uses the checkpoint's covariance, which would be too small."""
 ZLIB_LEVEL = 9
 """Compression level. Level 6 makes the file 1 % larger."""
+
 log = structlog.get_logger(__name__)
 
 

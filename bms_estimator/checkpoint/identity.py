@@ -1,4 +1,4 @@
-"""Identity of a pack: hashes of settings and cell data that decide whether a saved state applies."""
+"""Identity of a pack: hashes of settings and cell data, by which a saved state is accepted, shortened or rejected."""
 
 import hashlib
 from collections.abc import Mapping

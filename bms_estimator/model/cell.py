@@ -1,7 +1,6 @@
-"""Cell model: contents of a cell file, with a1..a21.
+"""Cell model: contents of a cell file, with a1..a21 (``cell_sections``), and the shipped, generic and user's cell files.
 
-Numbers in parentheses are equations of the thesis, and lemmas are those of the thesis. a1..a15 are the parameters of the circuit
-elements over SOC. a16..a21 are the parameters of the open-circuit voltage.
+Numbers in parentheses are equations of the thesis, and lemmas are those of the thesis.
 
 The values describe ``series_count`` cells in series as one two-terminal object. ``CellModel.pack`` scales them to packs
 of such objects in series and parallel.

@@ -1,4 +1,4 @@
-"""Runtime of a long-running process: log on stderr, signals, delays before retries, and ending of tasks."""
+"""Runtime of a long-running process: log on stderr, signals, delays before retries, and ending of tasks by cancellation."""
 
 import asyncio
 import contextlib
@@ -18,6 +18,7 @@ from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.settings.pack import LogLevel
 
 Result = TypeVar("Result")
+"""Result of a coroutine."""
 LEVELS: tuple[LogLevel, ...] = get_args(LogLevel)
 _levels: dict[str, LogLevel] = {}
 """Log levels by pack."""

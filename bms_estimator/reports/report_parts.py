@@ -1,4 +1,4 @@
-"""Parts of a report: numbers as text, plots as inline SVG, the page, and the group on aging: capacity and resistances over days.
+"""Parts of a report: numbers as text, plots as inline SVG, and the page.
 
 The HTML is self-contained, without scripts and external resources. It is made from the Jinja2 templates in ``templates``.
 """

@@ -1,4 +1,4 @@
-"""Values of single cells: payload of the topic ``cells``, columns of a table of estimates, and inputs of the alarms; and the weakest cell."""
+"""Values of single cells and of the weakest one: payload of the topic ``cells``, columns of a table, and inputs of the alarms."""
 
 import math
 from typing import Any, NamedTuple

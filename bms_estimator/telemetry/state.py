@@ -1,4 +1,4 @@
-"""Payloads of the topics ``state``, ``info`` and ``forecast``, and the text of a cut-off."""
+"""Payloads of the topics ``state``, ``info`` and ``forecast``, the text of a cut-off, and the pack's capacity."""
 
 import math
 from collections.abc import Mapping

@@ -22,6 +22,7 @@ from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.runtime import result_before
 
 Result = TypeVar("Result")
+"""Result of ``retry_until_ready``."""
 _TEXT_BY_CLASS: dict[type[BaseException], str] = {
     nats.js.errors.NotFoundError: "a stream is missing on the server: create it with `bms-estimator fleet serve`",
     nats.js.errors.NoStreamResponseError: "no node leads the stream now, or the server keeps no streams for this account",
