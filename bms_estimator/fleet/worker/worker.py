@@ -29,7 +29,7 @@ from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.block_runner import Totals
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
-from bms_estimator.fleet.worker.heartbeats import HeartbeatReport
+from bms_estimator.fleet.worker.heartbeat_report import HeartbeatReport
 from bms_estimator.fleet.worker.lease_tasks import LeaseTasks, PeriodicStorage, UnknownPacks, UnsavedCheck
 from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
