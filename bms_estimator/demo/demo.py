@@ -26,8 +26,8 @@ from bms_estimator.process.child_process import find_server, terminate_with_pare
 from bms_estimator.process.listener import is_free
 from bms_estimator.process.runtime import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.settings.connections import DEFAULT_LISTEN, MqttSettings, PageSettings, parse_listen
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from bms_estimator.settings.outputs import DEFAULT_LISTEN, MqttSettings, PageSettings, parse_listen
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps

@@ -11,7 +11,7 @@ from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, LoginError, brokers, check
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.settings.sources.fieldbus import MODBUS_PROFILES
 from bms_estimator.setup.broker_login import BrokerLogin

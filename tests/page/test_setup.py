@@ -8,7 +8,7 @@ import pytest
 from aiohttp import ClientSession
 from playwright.async_api import Page, expect
 
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.setup.page.setup_server import SetupServer
 from bms_estimator.simulation.simulated_pack import SimulatedBms

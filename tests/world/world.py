@@ -20,8 +20,8 @@ from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.pack.state import REFUSED, PackState
 from bms_estimator.service import pack_service as service
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings
-from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings, StateSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.arrays_file import pack_identity
+from bms_estimator.checkpoint.identity import pack_identity
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import Estimator, make_estimator
 from bms_estimator.estimator.settings_plausibility import load_cutoff_v

@@ -15,7 +15,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.page.page_server import FILES as PAGE_FILES
 from bms_estimator.page.web_server import File, WebServer
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.setup.answers import InvalidAnswerError
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.page.session import SetupSession

@@ -14,8 +14,8 @@ from urllib.parse import quote
 import pytest
 
 from bms_estimator.protocols.firmware.messages import Hello
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.observer import ChargeLimits
-from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_pack import SimulatedBms
