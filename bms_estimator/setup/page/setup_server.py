@@ -79,6 +79,7 @@ class SetupServer(WebServer):
     def _show(self, estimate: Estimate) -> None:
         """Send an estimate to the page."""
         values = {
+            "unknown": estimate.soc is not None and not estimate.soc_known,
             "soc": None if estimate.soc is None else 100.0 * estimate.soc,
             "band": None if estimate.soc_std is None else 200.0 * estimate.soc_std,  # two standard deviations [%]
             "voltage": estimate.voltage_v,

@@ -12,6 +12,7 @@ from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
 from bms_estimator.setup.new_pack import run_command
 from bms_estimator.setup.page.session import SetupSession, Step
 from bms_estimator.setup.questions import QUESTIONS, Question
+from bms_estimator.telemetry.state import UNKNOWN_SOC
 
 TITLES = {
     Step.SEARCH: "Search",
@@ -136,13 +137,13 @@ def _done(session: SetupSession, _: str) -> str:
     install, run = escape(shlex.join(root_command("install", session.file))), escape(run_command(session.file))
     current_a = session.measured.current_a if session.measured else 0.0
     note = load_note(current_a, session.pack.cell.cell.capacity_ah)
-    note = f'<p class="note">{note}</p>' if note else ""
     return (
-        '<section class="card"><h2>State of charge</h2><p class="huge"><b data-q="soc">&nbsp;</b><small>%</small></p>'
-        '<p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p>'
+        '<section class="card"><h2>State of charge</h2><div id="known"><p class="huge"><b data-q="soc">&nbsp;</b>'
+        '<small>%</small></p><p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p></div>'
+        f'<div id="unknown" hidden><p class="unknown">not known yet</p><p>{UNKNOWN_SOC.partition(": ")[2].capitalize()}.</p></div>'
         '<p id="wait" role="status">Waiting for the first estimate. The first start compiles the kernels, which takes a '
         'minute or two.</p><p>measured <b data-q="voltage"></b> V, <b data-q="current"></b> A</p>'
-        f"{note}</section>"
+        f'<p class="note">{note}</p></section>'
         f'<section class="card"><h2>{escape(str(session.file))} is written</h2><p>{escape(session.pack.summary)}</p>'
         f"{warnings}<p>End this program, then run the estimator here:</p><pre>{run}</pre>"
         f"<p>or install the service:</p><pre>{install}</pre></section>"
