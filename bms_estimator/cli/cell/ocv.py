@@ -102,7 +102,7 @@ def ocv(
         float | None,
         typer.Option(
             parser=decimal(1e-6),
-            help="capacity with which the SOC is counted [Ah]; default: capacity measured by a slow discharge",
+            help="capacity of the cell [Ah]; required unless a capture is a slow discharge from full to empty",
             show_default=False,
         ),
     ] = None,
@@ -116,8 +116,8 @@ def ocv(
         float | None,
         typer.Option(
             parser=decimal(0.0, 1.0),
-            help="initial SOC, 0..1, of the captures that start at the highest voltage; the SOC of other captures is read "
-            "from the OCV curve; default: 1 if the highest voltage is that of a full cell",
+            help="initial SOC, 0..1, of the captures that start at the highest voltage; required unless their first rest shows "
+            "a full cell. The SOC of other captures is read from the OCV curve",
             show_default=False,
         ),
     ] = None,

@@ -27,13 +27,15 @@ COMMANDS = {
         "bms_estimator.cli.fleet.ingest:ingest", "Receive batches of samples from a telemetry platform."
     ),
     "status": LazyCommand(
-        "bms_estimator.cli.fleet.status:status", "List the workers, their versions and the partitions they refuse."
+        "bms_estimator.cli.fleet.status:status",
+        "List the workers, their versions and the partitions that they cannot read.",
     ),
     "dead-letters": LazyCommand(
         "bms_estimator.cli.fleet.dead_letters:app", "List or replay blocks that workers could not process."
     ),
     "checkpoints": LazyCommand(
-        "bms_estimator.cli.fleet.checkpoints:app", "List the stored states of all packs, or return to those of a day."
+        "bms_estimator.cli.fleet.checkpoints:app",
+        "List the stored states of all packs, or return to those of an earlier day.",
     ),
     "backup": LazyCommand(
         "bms_estimator.cli.fleet.backup:backup", "Write a backup of a tenant's streams while they are in use."
@@ -67,7 +69,7 @@ app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
     add_completion=False,
-    help="Estimate many packs: their edges send samples to a NATS server, and workers estimate.",
+    help="Estimate many packs: at each pack an edge sends samples to a NATS server, and workers estimate.",
 )
 
 

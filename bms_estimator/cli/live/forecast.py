@@ -92,7 +92,7 @@ def forecast(
     ] = None,
     capture: Annotated[
         Path | None,
-        typer.Option(help=f"capture from whose end to forecast: {CAPTURE_FORMATS}", show_default=False),
+        typer.Option(help=f"capture at whose end the forecast starts: {CAPTURE_FORMATS}", show_default=False),
     ] = None,
     cell: Annotated[
         str | None,
@@ -113,8 +113,8 @@ def forecast(
 ) -> None:
     """Forecast the time to cut-off under an expected load, from the state of a pack or from the end of a capture.
 
-    The state comes from the last checkpoint of the pack's service, which may be running. If no load is given, a load like
-    the observed one is expected.
+    The state comes from the last checkpoint of the pack's service, which may be running.
+    If no load is given, a load like the observed one is expected.
     """
     if pack is None and capture is None:
         raise UserError("give the settings file of a pack, or --capture FILE --cell NAME")

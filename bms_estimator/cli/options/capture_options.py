@@ -98,7 +98,7 @@ MappedColumns = Annotated[
         parser=parse_column_map,
         metavar="time=COLUMN,...",
         help="names of the columns with time, current, voltage and temperature, as in 'time=Time \\[ms],current=I'; a unit may "
-        "follow in brackets. In a Home Assistant export they are entities. sheet=SHEET selects a sheet of a spreadsheet. "
+        "follow in brackets. For a Home Assistant export give entities. sheet=SHEET selects a sheet of a spreadsheet. "
         "instance=NUMBER selects one of several batteries",
         show_default=False,
     ),

@@ -54,9 +54,9 @@ def install_command(
 ) -> None:
     """Install the service, or upgrade it: user, settings, systemd units and udev rule. Requires root.
 
-    An upgrade keeps settings and state. A program in a home folder is copied to /opt/bms-estimator, because services
-    have no access to home folders. To upgrade the copy, run the `install` command again from the
-    program in the home folder.
+    An upgrade keeps settings and state.
+    A program in a home folder is copied to /opt/bms-estimator, because services have no access to home folders.
+    To upgrade the copy, run the `install` command again from the program in the home folder.
     """
     machine = _machine(root, "install", [str(pack.resolve())] if pack else [])
     files = _check(pack) if pack else None
