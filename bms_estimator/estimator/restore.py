@@ -85,6 +85,8 @@ def is_within(values: NDArray[Any], limits: tuple[float, float]) -> bool:
 
 _PARTS_WITHOUT_FILTER = ("observer.", "learning.", "series_resistance.")
 """Prefixes of the fields that are also estimated while the filter is off."""
+_FINITE_PARTS = ("observer", "learning", "series_resistance", "filter", "checks", "anchors", "map")
+"""Parts that are refused with a value that is not finite."""
 MAX_COUNT = 1e15
 """Maximum plausible absolute value of a counter: the number of samples of 30,000 years at 1,000 a second."""
 MAX_SUM = 1e24
@@ -172,11 +174,7 @@ def _invalid_state_reason(estimator: Estimator, after_first_sample: NDArray[np.v
     record, cell = estimator.record, estimator.cell.cell
     for (name, field), (_, first_field) in zip(fields(record), fields(after_first_sample), strict=True):
         part, _, quantity = name.partition(".")
-        checked = np.isfinite(first_field)
-        if (
-            part in ("observer", "learning", "series_resistance", "filter", "checks", "anchors", "map")
-            and not np.isfinite(field[checked]).all()
-        ):
+        if part in _FINITE_PARTS and not np.isfinite(field[np.isfinite(first_field)]).all():
             return f"{quantity} of the {part} is not finite"
     s, first = record[0]["observer"], after_first_sample[0]["observer"]
     if not s["started"]:

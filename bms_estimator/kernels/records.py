@@ -25,8 +25,11 @@ unseen_s           ``Estimator.resume``              -
 
 Outside the kernels, only ``estimator`` writes fields. Exceptions: a worker of a fleet replaces the record and writes
 ``history.enabled``; the simulation of the thesis sets ``observer.v_ts`` and ``v_tl``. Other states of a pack are not in the record:
-single cells (``estimator.cell_estimator``), rows and fits (``pack_model``), load (``forecast``), totals (``pack``), alarms
-(``telemetry.alarms``).
+single cells (``estimator.cell_estimator``), rows and fits (``pack_model``), load (``forecast``), totals
+(``telemetry.publish_window``), alarms (``telemetry.alarms``).
+
+A checkpoint contains all parts. ``estimator.restore`` lists the parts that are restored although the identifier was off, and the
+parts that must be finite.
 
 (3.18) and (4.2) are equations of the thesis.
 """

@@ -1,5 +1,7 @@
 """Trace of the estimator: one row of values for each accepted sample.
 
+A column with the name of a field of ``Estimate`` is published (``telemetry.state.COPIED``).
+
 Numbers in parentheses are equations of the thesis.
 """
 

@@ -18,7 +18,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.definitions import Change
-from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload
+from bms_estimator.telemetry.cells import make_cells_payload, single_cell_fields
 from bms_estimator.telemetry.health import (
     DEVICE_SOC_SUSPICION,
     contradicts_device,
@@ -275,7 +275,7 @@ class Publisher:
             wall_s,
             self._charge_energy,
             capacity_ah,
-            estimate_fields(self._pack),
+            single_cell_fields(self._pack),
             self._device_soc,
         )
 

@@ -1,1 +1,1 @@
-"""Published payloads from the state of the estimator: state, parameters, health, alarms, info."""
+"""Published payloads from the state of the estimator: state, parameters, health, alarms, info; totals of all runs."""

@@ -49,7 +49,7 @@ def weakest_cell(pack: Pack) -> WeakestCell | None:
     return WeakestCell(None, soc, soc_std, weakest.capacity_ratio, weakest)
 
 
-def estimate_fields(pack: Pack) -> dict[str, Any]:
+def single_cell_fields(pack: Pack) -> dict[str, Any]:
     """Return the fields of ``Estimate`` about single cells; empty before their first estimate."""
     cell = weakest_cell(pack)
     if cell is None:

@@ -189,7 +189,7 @@ def make_state_payload(
         now_s: Wall clock [s since 1970].
         charge_energy: Charge and energy at the terminals.
         capacity_ah: Rated capacity of the pack [Ah]; None for a fuel cell.
-        cell_fields: Fields about single cells (``telemetry.cells.estimate_fields``).
+        cell_fields: Fields about single cells (``telemetry.cells.single_cell_fields``).
         device_soc: SOC that the device reports, 0..1; None: not reported.
     """
     # a tuple of plain numbers, because reading the fields of a numpy record one by one is slow

@@ -35,7 +35,7 @@ from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.health import Payload
 from bms_estimator.pack.state import CHECKPOINT, REFUSED
-from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload
+from bms_estimator.telemetry.cells import make_cells_payload, single_cell_fields
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import ChargeEnergy, Window
 from bms_estimator.telemetry.state import make_state_payload, remaining_capacity_ah
@@ -238,7 +238,7 @@ class BlockProcessor:
                 now_s,
                 totals,
                 pack_type.capacity_ah,
-                estimate_fields(pack_type.pack),
+                single_cell_fields(pack_type.pack),
             )
         )
 

@@ -1,1 +1,1 @@
-"""Sums over samples: charge and energy, publish window, hour."""
+"""Sums over samples: charge and energy, publish window, hour, row of the fit history; certainty of the SOC."""

@@ -20,7 +20,7 @@ from bms_estimator.pack.pack import assemble
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
-from bms_estimator.telemetry.cells import estimate_fields
+from bms_estimator.telemetry.cells import single_cell_fields
 from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter, Window
 from bms_estimator.telemetry.state import NAMES, make_state_payload, remaining_capacity_ah
 from tests.fleet.partition_stream import STORE_ID_NS, estimates_of
@@ -136,7 +136,7 @@ def test_state_agrees_in_every_field_with_that_of_a_replay(blocks):
         0.0,
         totals,
         CAPACITY_AH,
-        estimate_fields(pack),
+        single_cell_fields(pack),
     )
     state, expected = json.loads(results[-1].state), json.loads(replayed.model_dump_json())
     assert state.keys() == expected.keys()
