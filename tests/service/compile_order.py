@@ -38,13 +38,17 @@ class Recorder(event.Listener):
             self.lines.append((levels_below(ended.data["dispatcher"]), f"{duration - of_callees:.2f} {call}"))
 
 
+def callees(kernel):
+    """Return the kernels that a kernel calls."""
+    function = kernel.py_func
+    names = {each.argval for each in dis.get_instructions(function) if each.opname == "LOAD_GLOBAL"}
+    return [each for name in names if isinstance(each := function.__globals__.get(name), Dispatcher)]
+
+
 @functools.cache
 def levels_below(kernel):
     """Return the number of levels of kernels that a kernel calls."""
-    function = kernel.py_func
-    names = {each.argval for each in dis.get_instructions(function) if each.opname == "LOAD_GLOBAL"}
-    callees = [function.__globals__.get(name) for name in names]
-    return max((1 + levels_below(each) for each in callees if isinstance(each, Dispatcher)), default=0)
+    return max((1 + levels_below(each) for each in callees(kernel)), default=0)
 
 
 def text(argument, names):

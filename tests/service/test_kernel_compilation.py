@@ -1,5 +1,6 @@
 """Compilation in child processes: the recorded order, the end of a child, and a child that fails."""
 
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ from bms_estimator.service.kernel_compilation import (
     compile_order,
     is_compiled,
 )
+from tests.service.compile_order import callees
 
 FIRST_START = """
 import gc
@@ -50,6 +52,13 @@ print(outcomes["checkpoint"][:8], bool(loaded), loaded - recorded, compiled.buff
 def test_the_recorded_order_is_that_of_this_version() -> None:
     """If it fails: ``make compile-order``."""
     assert subprocess.check_output([sys.executable, "-c", FIRST_START], text=True) == "restored True set() []\n"
+
+
+def test_the_order_contains_the_kernels_that_its_kernels_call() -> None:
+    """numba does not load callees from a full cache, so that the test of the recorded order does not see them."""
+    names = [kernel.call.split(" ")[0].rpartition(".") for kernel in compile_order()]
+    kernels = {getattr(importlib.import_module(f"bms_estimator.{module}"), name) for module, _, name in names}
+    assert {each for kernel in kernels for each in callees(kernel)} <= kernels
 
 
 @pytest.fixture
