@@ -20,7 +20,7 @@ PROMETHEUS_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-prometh
 HA_FOLDER = $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/bms_estimator-home-assistant/$(HOME_ASSISTANT)
 
 # Programs that the tests run: compiler and simulator of the board, a broker, systemd's checks.
-APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium qemu-user mmdebstrap libfaketime
+APT := gcc gcc-avr avr-libc arduino-core-avr simavr libsimavr-dev libelf-dev influxdb mosquitto mosquitto-clients systemd systemd-container udev chromium qemu-user mmdebstrap libfaketime strace
 
 .DEFAULT_GOAL := help
 .PHONY: help venv apt audit check deb deb-arm64 addon docs test test-all prepared collected demo demo-fleet fleet fleet-kills benchmark home-assistant real-home-assistant anywhere month electrochemical bank cells power resolution unseen nats ble chapter5 ablation ablation-weeks forecast load page screenshots fuzz simulate firmware kernels integrations prometheus payloads cell-schema compile-order notebook lock

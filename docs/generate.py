@@ -16,8 +16,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Health, Payload
 from bms_estimator.model.payloads.snapshot import Alarm, CellsReport, ForecastReport, Info, ParameterReport
 from bms_estimator.reports.thesis.report import build
-from bms_estimator.reports.thesis.report_items import Table
-from bms_estimator.reports.thesis.report_items import name as item_name
+from bms_estimator.reports.thesis.report_items import Table, name as item_name
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.settings_template import settings_file
 

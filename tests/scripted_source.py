@@ -8,6 +8,7 @@ import numpy as np
 
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.model.payloads.snapshot import Snapshot
+from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples
 from tests.patience import LONG_S
 
@@ -47,7 +48,7 @@ class ScriptedSource:
         self._queue.put_nowait(None)
 
 
-class Collector:
+class Collector(Sink):
     """Sink that stores its snapshots."""
 
     def __init__(self) -> None:
@@ -57,12 +58,6 @@ class Collector:
     def publish(self, snapshot: Snapshot) -> None:
         self.snapshots.append(snapshot)
         self._received.set()
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        pass
 
     async def until(self, accepts: Callable[[Snapshot], bool], skip: int = 0) -> Snapshot:
         """Wait for a snapshot that ``accepts`` accepts, and return it. The first ``skip`` snapshots are ignored."""

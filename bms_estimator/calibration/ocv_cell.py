@@ -8,8 +8,8 @@ import numpy as np
 
 from bms_estimator.calibration.cleaning.capture_checks import FULL_SOC
 from bms_estimator.calibration.cleaning.clean_capture import remove_glitches
-from bms_estimator.calibration.elements.initial_elements import curve as generic_curve
 from bms_estimator.calibration.elements.initial_elements import (
+    curve as generic_curve,
     initial_elements,
     nearest_generic_cell,
     scaled_generic_ladder,
@@ -24,7 +24,8 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each, soc_from_ocv
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import ELEMENTS, Cell, CellModel, Ladder, generic_cells, load_cell
+from bms_estimator.model.cell import Cell, CellModel, generic_cells, load_cell
+from bms_estimator.model.cell_sections import ELEMENTS, Ladder
 from bms_estimator.model.charge_count import charge_ah
 from bms_estimator.model.errors import UserError
 

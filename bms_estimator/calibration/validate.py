@@ -10,8 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bms_estimator.calibration.cleaning.capture_checks import capture_contradictions, soc_outside
-from bms_estimator.calibration.cleaning.capture_checks import initial_soc as soc_of_first_rest
+from bms_estimator.calibration.cleaning.capture_checks import (
+    capture_contradictions,
+    initial_soc as soc_of_first_rest,
+    soc_outside,
+)
 from bms_estimator.calibration.cleaning.clean_capture import REST_C_RATE, CleanCapture, are_mismatched, clean_capture
 from bms_estimator.calibration.elements.replay_score import MIN_SOC, SETTLING_S
 from bms_estimator.calibration.ocv.overpotential import overpotential

@@ -20,21 +20,17 @@ import structlog
 from numpy.typing import NDArray
 
 from bms_estimator.checkpoint.arrays_file import (
-    CHANGES_SUFFIXES,
     HISTORY_SUFFIX,
     LOAD_SUFFIX,
     ArraysFile,
-    BaseCheckpoint,
-    ChangesFile,
     RejectedFileError,
-    observer_identity,
-    pack_identity,
     read_arrays,
     reject_damaged,
     set_aside,
-    without_observer,
     write_arrays,
 )
+from bms_estimator.checkpoint.changes_file import CHANGES_SUFFIXES, BaseCheckpoint, ChangesFile
+from bms_estimator.checkpoint.identity import observer_identity, pack_identity, without_observer
 from bms_estimator.checkpoint.run_file import PackDescription, RunFile, SavedRun
 from bms_estimator.kernels.kalman_filter.records import SCRATCH
 from bms_estimator.model.arrays import fields
@@ -52,7 +48,7 @@ from bms_estimator.pack.state import (
     DeclaredValues,
     PackState,
 )
-from bms_estimator.process.host import BootTimestamp, boot_timestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp, boot_timestamp
 from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.settings.pack import Settings
 

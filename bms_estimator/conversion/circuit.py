@@ -26,7 +26,8 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
 )
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.version import __version__
 
 TEMPLATES = Path(__file__).with_name("templates")

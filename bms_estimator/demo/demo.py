@@ -26,12 +26,13 @@ from bms_estimator.process.child_process import find_server, terminate_with_pare
 from bms_estimator.process.listener import is_free
 from bms_estimator.process.runtime import stop_on_signal
 from bms_estimator.service.pack_service import run_pack_service
+from bms_estimator.settings.connections import DEFAULT_LISTEN, MqttSettings, PageSettings, parse_listen
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from bms_estimator.settings.outputs import DEFAULT_LISTEN, MqttSettings, PageSettings, parse_listen
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
 from bms_estimator.simulation.virtual_board import VirtualBoard
+from bms_estimator.sinks.sink import Sink
 from bms_estimator.sinks.terminal.sink import TerminalSink
 from bms_estimator.sinks.terminal.view_state import BAND_STDS
 
@@ -263,7 +264,7 @@ def _settings(path: str, url: str, page: str, rate_hz: int, initial_soc: float) 
     )
 
 
-class DemoResult:
+class DemoResult(Sink):
     """Sink that stores the last estimate and the true SOC at that time.
 
     Args:
@@ -276,10 +277,6 @@ class DemoResult:
         self._last: Estimate | None = None
         self._last_true_soc = 0.0
         self._started_s = time.monotonic()
-
-    async def __aenter__(self) -> Self:
-        """Return the sink."""
-        return self
 
     async def __aexit__(self, *_: object) -> None:
         """Do nothing, because the sink holds no resources."""

@@ -25,7 +25,7 @@ from bms_estimator.mqtt.connection import (
 )
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector
 from bms_estimator.process.systemd import is_unreadable_credential
-from bms_estimator.settings.outputs import BrokerSettings
+from bms_estimator.settings.connections import BrokerSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY
 
 NAME = "broker"

@@ -21,7 +21,7 @@ from bms_estimator.doctor.service_check import check_service
 from bms_estimator.installation import paths
 from bms_estimator.installation.machine import root_command
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.host import TIMESYNCD, is_clock_synchronized
+from bms_estimator.process.boot_timestamp import TIMESYNCD, is_clock_synchronized
 from bms_estimator.service import pack_check
 from bms_estimator.version import __version__
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from bms_estimator.doctor.finding import ExaminedPack, Finding, ok, warning
 from bms_estimator.installation.machine import root_command
 from bms_estimator.numba_cache import SHIPPED_FOLDER, cache_folders, source_digest
-from bms_estimator.process.host import available_bytes
+from bms_estimator.process.memory import available_bytes
 from bms_estimator.service.kernel_compilation import CHILD_BYTES, COMPLETE_FILE
 
 NAME = "kernel cache"

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from bms_estimator.doctor.finding import ExaminedPack, Finding, fault, ok, warning
 from bms_estimator.doctor.systemd_unit import SystemdUnit
-from bms_estimator.process.host import has_memory_groups
+from bms_estimator.process.memory import has_memory_groups
 
 NAME = "service"
 INVALID_SETTING = 2

@@ -1,163 +1,39 @@
 """Sender of a pack's raw samples to a fleet's server, by MQTT, in blocks.
 
-``BlockSender`` collects samples in blocks, sends the blocks and receives the workers' confirmations. ``BlockStore``
-stores blocks until a worker has confirmed them. ``SampleClock`` converts the times of a source to a clock that never steps back.
+``BlockSender`` collects samples in blocks, sends the blocks and receives the workers' confirmations. ``BlockQueue``
+stores blocks until a worker has confirmed them.
 """
 
 import asyncio
 import contextlib
-import math
 import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Self
 
-import numpy as np
 import structlog
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.edge.batching import MAX_SAMPLES, Batcher, ReadyBlock
-from bms_estimator.edge.block_store import RETRY_S, BlockStore
+from bms_estimator.edge.block_queue import RETRY_S, BlockQueue
 from bms_estimator.edge.block_table import EDGE_TABLES
 from bms_estimator.edge.cell_voltages import MAX_CELLS
+from bms_estimator.edge.sample_clock import SampleClock
 from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.model.clock import Clock, since_boot
 from bms_estimator.model.payloads.health import EdgeHealth
 from bms_estimator.mqtt.connection import Connect, Connection, ConnectOptions, DeliveryStats, brokers, check
 from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
-from bms_estimator.process.runtime import FIRST_DELAY_S, end, finish
-from bms_estimator.settings.outputs import EdgeSettings
-from bms_estimator.store.database import RETRY_S as DISK_RETRY_S
-from bms_estimator.store.database import Database
-
-Times = NDArray[np.float64]
-
-DEAD_BAND_S = 1.0
-"""Maximum difference between the source's clock and the host's that is not corrected [s], because transport delays vary
-too."""
-STEP_S = 10.0
-"""Minimum difference between the clocks that counts as a step and not as drift [s]. The skipped time becomes a gap."""
-SLEW = 0.01
-"""Relative rate at which a difference between ``DEAD_BAND_S`` and ``STEP_S`` is corrected. It exceeds the drift of any
-resonator."""
-WINDOW_S = 600.0
-"""Window over which the smallest delay is taken [s]. Samples arrive late and never early, so the smallest delay is the
-lag of the source's clock."""
-GRID = 2.0**20
-"""Clock offsets are multiples of ``1 / GRID`` seconds. With these offsets, a constant sample period stays constant to
-the last bit, which compresses best."""
-
-
-class SampleClock:
-    """Clock in seconds since 1970 that never decreases, even if the wall clock does.
-
-    The source's clock gives the intervals between samples. The host's wall clock gives the start, and the host's
-    steady clock gives the corrections. The clock follows a wall clock that is set ahead, as on a machine that boots
-    without the time; the step becomes a gap. The clock ignores a wall clock that is set back.
-
-    Args:
-        last_s: Time of the last sample of an earlier run [s since 1970]; minus infinity without an earlier run.
-
-    Attributes:
-        steps: Number of times that a clock was set or the source started.
-    """
-
-    def __init__(self, last_s: float = -math.inf) -> None:
-        self.steps = 0
-        self._last_s = last_s
-        self._lead_s = math.nan  # this clock minus the host's steady clock
-        self._source_s = math.nan  # the source's clock at the last sample
-        self._offset_s = 0.0  # this clock minus the source's
-        self._slew_s = 0.0  # remaining correction of the offset, applied at the rate SLEW
-        self._min_delay_s, self._window_s = math.inf, 0.0  # smallest delay in the window, and start of the window
-
-    def advance_to(self, time_s: float) -> None:
-        """Place the next sample at ``time_s`` if that is later than all placed samples [s since 1970]."""
-        if time_s > self._last_s:
-            self._last_s, self._lead_s, self._source_s = time_s, math.nan, math.nan
-
-    def place(self, source_s: Times, wall_s: float, steady_s: float) -> Times:
-        """Return timestamps of samples that have just arrived [s since 1970].
-
-        Args:
-            source_s: Times of the source's clock [s], shape (n,). A non-finite time is replaced by the previous one.
-            wall_s: Wall clock now [s since 1970].
-            steady_s: Monotonic clock that continues during suspend [s].
-        """
-        now_s = self._now(wall_s, steady_s)
-        source_s = _fill_non_finite(source_s, self._source_s)
-        runs = np.split(source_s, np.flatnonzero(np.diff(source_s) < 0.0) + 1)
-        return np.concatenate([self._place(run, now_s) for run in runs if run.size] or [source_s])
-
-    def _now(self, wall_s: float, steady_s: float) -> float:
-        """Return this clock's present time [s since 1970]."""
-        if math.isnan(self._lead_s):
-            self._lead_s = max(wall_s, self._last_s) - steady_s
-        elif wall_s - steady_s > self._lead_s + STEP_S:
-            self._lead_s = wall_s - steady_s
-            self._source_s = math.nan
-        return steady_s + self._lead_s
-
-    def _place(self, source_s: Times, now_s: float) -> Times:
-        """Return timestamps of samples between which the source's clock does not step back."""
-        delay_s = now_s - (float(source_s[-1]) + self._offset_s)
-        # the first comparison is also false for the first samples, when _source_s is NaN
-        if not source_s[0] >= self._source_s or delay_s < -STEP_S:
-            self._reset_mapping(source_s, now_s)
-        else:
-            self._update_drift(delay_s, now_s)
-        placed = source_s + self._offset_s
-        span_s = float(source_s[-1]) - self._source_s
-        if self._slew_s and span_s > 0.0:  # spread the correction evenly over the samples
-            shift_s = min(max(self._slew_s, -SLEW * span_s), SLEW * span_s)
-            placed += shift_s * (source_s - self._source_s) / span_s
-            self._offset_s += shift_s
-            self._slew_s -= shift_s
-        placed = np.maximum(placed, self._last_s)
-        self._source_s, self._last_s = float(source_s[-1]), float(placed[-1])
-        return placed
-
-    def _reset_mapping(self, source_s: Times, now_s: float) -> None:
-        """Map the last sample to now, unless the first one would then precede an earlier sample."""
-        offset_s = max(now_s - float(source_s[-1]), self._last_s - float(source_s[0]))
-        self._offset_s, self._slew_s = math.ceil(offset_s * GRID) / GRID, 0.0
-        self._source_s = float(source_s[0])
-        self._min_delay_s, self._window_s = math.inf, now_s
-        self.steps += 1
-
-    def _update_drift(self, delay_s: float, now_s: float) -> None:
-        """Schedule a correction if the source's clock runs ahead or falls behind."""
-        if delay_s < -DEAD_BAND_S:  # one sample from the future is proof, because transport only delays
-            self._slew_s = delay_s
-        self._min_delay_s = min(self._min_delay_s, delay_s)
-        if now_s - self._window_s < WINDOW_S:
-            return
-        behind_s, self._min_delay_s, self._window_s = self._min_delay_s, math.inf, now_s
-        if behind_s > STEP_S:
-            self._offset_s += math.floor(behind_s * GRID) / GRID
-            self._slew_s = 0.0
-            self.steps += 1
-        elif behind_s > DEAD_BAND_S:
-            self._slew_s = behind_s
-
-
-def _fill_non_finite(source_s: Times, previous_s: float) -> Times:
-    """Replace each non-finite time by the previous time, or by 0 at the start."""
-    if np.isfinite(source_s).all():
-        return source_s
-    filled = source_s.copy()
-    for i in np.flatnonzero(~np.isfinite(source_s)):
-        filled[i] = filled[i - 1] if i else (previous_s if math.isfinite(previous_s) else 0.0)
-    return filled
-
+from bms_estimator.process.runtime import FIRST_DELAY_S, end_tasks, finish
+from bms_estimator.settings.connections import EdgeSettings
+from bms_estimator.store.database import RETRY_S as DISK_RETRY_S, Database
 
 MIB = 1 << 20
 PACK = ""
-"""Name of the only pack in the store of an edge."""
-MAX_WAITING_SAMPLES = 500_000
+"""Name of the only pack in the queue of an edge."""
+MAX_UNWRITTEN_SAMPLES = 500_000
 """Maximum number of samples in memory while the disk cannot be written: 20 MB, or five days at one sample a second."""
 MAX_BLOCK_AGE = 1.5
 """Age at which an incomplete block is sent, as a multiple of the block duration."""
@@ -215,11 +91,13 @@ class BlockSender:
         self._database = Database(folder / f"{pack}.edge.sqlite", tables=EDGE_TABLES, sync_s=0.0, retry_s=retry_s)
         self._request_topic, topic = (each(pack).replace(".", "/") for each in (subjects.block_request, subjects.raw))
         max_bytes = settings.store_mib * MIB
-        self.store = BlockStore(self._database, lambda _: topic, max_bytes=max_bytes, max_waiting=MAX_WAITING_SAMPLES)
+        self.queue = BlockQueue(
+            self._database, lambda _: topic, max_bytes=max_bytes, max_unwritten=MAX_UNWRITTEN_SAMPLES
+        )
         self.delivery, self.invalid_messages = DeliveryStats(), 0
         # blocks are not retained, so that there is nothing to send again after a rejection
         self._denied = DeniedTopics(self.delivery, lambda: None, first_delay_s)
-        self._sender = QueueSender(self.store, self.delivery, self._denied, first_delay_s)
+        self._sender = QueueSender(self.queue, self.delivery, self._denied, first_delay_s)
         for warning in check(settings):
             log.warning("secret is readable by other users", reason=warning)
         options = ConnectOptions(f"bms-edge-{pack}-{secrets.token_hex(4)}", None, self._count_invalid)
@@ -252,7 +130,7 @@ class BlockSender:
                 task.result()  # only an internal error ends a task: raise it
         wall_s = self._clock.wall()
         # a new store may have been created later than the sample clock's time, if a worker had blocks of a later store
-        self._sample_clock.advance_to(self.store.position(PACK).last_s)
+        self._sample_clock.advance_to(self.queue.position(PACK).last_s)
         placed = samples.copy()
         placed["time_s"] = self._sample_clock.place(samples["time_s"], wall_s, self._steady())
         is_sent = self._sends_cells and cells_v.shape[1] <= MAX_CELLS
@@ -263,18 +141,18 @@ class BlockSender:
 
     def health(self) -> EdgeHealth:
         """Return counters of the blocks."""
-        store = self.store
+        queue = self.queue
         return EdgeHealth(
-            blocks_kept=store.unconfirmed,
-            blocks_unsent=store.waiting,
-            blocks_dropped=store.dropped,
+            blocks_kept=queue.unconfirmed,
+            blocks_unsent=queue.waiting,
+            blocks_dropped=queue.dropped,
             trouble=self.delivery.trouble,
         )
 
     async def __aenter__(self) -> Self:
-        """Open the store and start connecting to the server."""
-        await self.store.sync()
-        position = self.store.position(PACK)
+        """Open the queue and start connecting to the server."""
+        await self.queue.sync()
+        position = self.queue.position(PACK)
         log.info("store of blocks", made_s=position.created_s, next=position.next_number, oldest=position.oldest)
         self._sample_clock = SampleClock(position.last_s)
         self._tasks = [asyncio.create_task(task) for task in (self._link.run(), self._sync_repeatedly())]
@@ -287,8 +165,8 @@ class BlockSender:
         linking, syncing = self._tasks
         await finish(linking, self._final_send_timeout_s + DISCONNECT_TIMEOUT_S)
         self._database.begin_shutdown()
-        await end(syncing)
-        await self.store.sync()
+        await end_tasks(syncing)
+        await self.queue.sync()
         await self._database.__aexit__()
 
     def _watch_open_block(self) -> None:
@@ -305,14 +183,14 @@ class BlockSender:
 
     def _put(self, blocks: Sequence[ReadyBlock]) -> None:
         for block in blocks:
-            self.store.put(PACK, block)
+            self.queue.put(PACK, block)
             self._sync_requested.set()
 
     async def _sync_repeatedly(self) -> None:
         """Synchronize memory and disk on request, and retry after a failure."""
         while True:
             self._sync_requested.clear()
-            written = await self.store.sync()
+            written = await self.queue.sync()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(None if written else RETRY_S):
                     await self._sync_requested.wait()
@@ -346,7 +224,7 @@ class BlockSender:
             except ValidationError:
                 self._count_invalid("unreadable", message.topic)
             else:
-                self.store.on_request(PACK, request)
+                self.queue.on_request(PACK, request)
 
     def _count_invalid(self, reason: str, topic: str) -> None:
         """Count an invalid message on the workers' topic, and log the first one."""

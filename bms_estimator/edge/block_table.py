@@ -12,7 +12,7 @@ from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import HEADER_BYTES, MAX_NUMBER, Block, BlockError, decode_header, encode
 
 NS_PER_S = 1_000_000_000
-LATEST_S = MAX_NUMBER // NS_PER_S - 1
+MAX_CREATED_S = MAX_NUMBER // NS_PER_S - 1
 """Latest creation time of a store, in the year 2262 [s since 1970]."""
 MIN_CREATED_S = 1
 """Earliest creation time of a store [s since 1970]; 0 means that a pack has no store yet."""
@@ -108,14 +108,16 @@ def _is_position(row: Sequence[Any]) -> bool:
     if [*map(type, row)] != [int, int, float, int, int]:
         return False
     position = PackPosition(*row)
-    is_plausible = 0 <= position.created_s <= LATEST_S and 1 <= position.oldest <= position.next_number < MAX_NUMBER
+    is_plausible = (
+        0 <= position.created_s <= MAX_CREATED_S and 1 <= position.oldest <= position.next_number < MAX_NUMBER
+    )
     return is_plausible and 0 <= position.sent < position.next_number
 
 
 def write_changes(
     connection: sqlite3.Connection,
     positions: Mapping[str, PackPosition],
-    waiting: Sequence[tuple[str, ReadyBlock]],
+    unwritten: Sequence[tuple[str, ReadyBlock]],
     removed: Collection[str],
     progress: Progress,
     *,
@@ -126,8 +128,8 @@ def write_changes(
 
     Args:
         connection: Connection with an open transaction.
-        positions: Positions before ``waiting`` of all packs that have changed. Blocks before ``oldest`` are deleted.
-        waiting: Blocks to insert, by pack; sample times are seconds since 1970.
+        positions: Positions before ``unwritten`` of all packs that have changed. Blocks before ``oldest`` are deleted.
+        unwritten: Blocks to insert, by pack; sample times are seconds since 1970.
         removed: Packs whose blocks and position are removed, before blocks are inserted.
         progress: New content of table ``progress``.
         max_blocks: Maximum number of stored blocks of a pack.
@@ -143,7 +145,7 @@ def write_changes(
         connection.execute("DELETE FROM block WHERE pack = ?", (pack,))
         connection.execute("DELETE FROM pack WHERE name = ?", (pack,))
     after = dict(positions)
-    for pack, ready in waiting:
+    for pack, ready in unwritten:
         after[pack] = _insert(connection, pack, after[pack], ready)
     first = [(pack, max(at.oldest, at.next_number - max_blocks)) for pack, at in after.items()]
     connection.executemany("DELETE FROM block WHERE pack = ? AND number < ?", first)

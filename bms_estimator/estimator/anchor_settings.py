@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS
 from bms_estimator.kernels.kalman_filter.anchors import ANCHOR_SETTINGS, FULL_STD
 from bms_estimator.kernels.kalman_filter.ekf import INDEPENDENT_R_STD
-from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.monotone_cubic import MonotoneCubic
 from bms_estimator.settings.observer import ChargeLimits
 

@@ -16,7 +16,8 @@ from bms_estimator.kernels.kalman_filter.equivalent_circuit import C_TL, C_TS, R
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION, node_error_scale, node_position
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, LN_Q, LN_R, LN_R0, NODE, NODES, OFFSET
 from bms_estimator.model.arrays import Floats, exp
-from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import TableOcv
 
 MAX_CAPACITY_STD = 0.3
 """Maximum relative std of the capacity that a cell file may contain."""

@@ -1,5 +1,6 @@
-"""Checks for valid but implausible settings, such as a wrong unit or a wrong number of cells, and the cut-off voltage."""
+"""Checks for valid but implausible settings, such as a wrong unit or a wrong number of cells, and the end of the forecast."""
 
+import functools
 import math
 from collections.abc import Iterator
 
@@ -23,7 +24,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.fieldbus import CanSource, ModbusSource
 
 
-def load_cutoff_v(settings: Settings, cell: CellModel) -> float:
+def forecast_end_v(settings: Settings, cell: CellModel) -> float:
     """Return the terminal voltage at which the load is switched off and the forecast ends [V].
 
     It is the first configured value of ``pack.cutoff_v``, ``pack.cutoff_voltage_v``, the limit of the alarm
@@ -40,8 +41,9 @@ def load_cutoff_v(settings: Settings, cell: CellModel) -> float:
     if pack.cutoff_v is not None:
         full_v = float(ocv_v[-1]) if pack.full_voltage_v is None else pack.full_voltage_v
         if pack.cutoff_v >= full_v:
-            message = f"must be below {full_v:.4g} V, the voltage of the full pack"
-            raise UserError(f"pack.cutoff_v = {pack.cutoff_v:g}: {message}")
+            raise UserError(
+                f"pack.cutoff_v = {pack.cutoff_v:g}: must be below {full_v:.4g} V, the voltage of the full pack"
+            )
         return pack.cutoff_v
     if pack.cutoff_voltage_v is not None:
         return pack.cutoff_voltage_v
@@ -68,6 +70,15 @@ RESTING_SOC = 0.02, 0.98
 """SOC between which the OCV is compared. Beyond, the curve is steep, and cells leave it soon after a charge or discharge."""
 RESTING_V = 0.05
 """Maximum deviation of a resting cell from the OCV [V]: error of a voltage sensor, and relaxation."""
+MIN_REST_S = 600.0
+"""Duration of a rest after which the voltage is within ``RESTING_V`` of the OCV also after a charge or discharge [s]."""
+COUNTED_SOC, COUNTED_V = (0.3, 0.7), 0.15
+"""SOC above and below which the counted charge narrows the range no further, and maximum deviation from the OCV there [V].
+It includes differences between manufacturers: 0.07 V on the plateau of LFP, 0.1 V for NMC that is charged to 4.35 V."""
+MAX_OFFSET_C = 0.02
+"""Offset of a current sensor relative to the capacity [1/h], which the counted charge may contain."""
+MAX_GAP_S = 120.0
+"""Time between two samples from which on the charge between them is unknown [s]."""
 BELOW_EMPTY_V, ABOVE_FULL_V = 0.5, 0.3
 """Margins below the OCV at SOC 0, for a load, and above the OCV at SOC 1, for a charger [V]. Both include differences
 between manufacturers."""
@@ -89,136 +100,160 @@ def implausible_settings(settings: Settings, cell: PackModel) -> list[str]:
     Raises:
         UserError: The cut-off voltage of the load is not below the voltage of the full pack.
     """
-    lines = cell.by_kind(lambda battery: _battery_lines(settings, battery), lambda stack: _stack_lines(settings, stack))
-    return [line for line in lines if line]
+    return list(
+        cell.by_kind(lambda battery: _battery_lines(settings, battery), lambda stack: _stack_lines(settings, stack))
+    )
 
 
-def implausible_measurement(cell: PackModel, voltage_v: float, current_a: float, device_ah: float) -> list[str]:
-    """Return one line for each setting of a battery that the first values of its device contradict.
+def implausible_measurement(
+    cell: PackModel,
+    voltage_v: float,
+    current_a: float,
+    device_ah: float,
+    soc_range: tuple[float, float] | None = None,
+) -> list[str]:
+    """Return one line for each setting of a battery that the values of its device contradict.
 
     Args:
         cell: Model of the whole pack.
         voltage_v: Voltage of the pack [V]; NaN: unknown.
         current_a: Current [A]; NaN: unknown.
         device_ah: Capacity that the device reports [Ah]; NaN: unknown.
+        soc_range: Lowest and highest SOC that the pack can have after its rest; None: it may have been charged or loaded just before.
     """
     return cell.by_kind(
-        lambda battery: list(_contradictions(battery, voltage_v, current_a, device_ah)), lambda _: list[str]()
+        lambda battery: list(_contradictions(battery, voltage_v, current_a, device_ah, soc_range)),
+        lambda _: list[str](),
     )
 
 
 class Contradictions:
-    """Settings that the first values of a device contradict, until its values at rest agree with them.
+    """Settings that the values of a device contradict, until its values at rest agree with them.
 
-    If the first values agree, later ones are not compared, because a pack that was just charged or is empty has another voltage.
+    The first values are compared. Later ones are compared after ``MIN_REST_S`` at rest, in the range of SOC that the charge
+    since the first sample leaves, because a pack that was just charged or is empty has another voltage.
 
     Args:
         cell: Model of the whole pack.
 
     Attributes:
-        texts: One line for each setting, with the values of the first comparison.
+        texts: One line for each setting, with the values that contradicted it first.
     """
 
     def __init__(self, cell: PackModel) -> None:
         self._cell, self._device_ah, self._is_compared, self.texts = cell, math.nan, False, list[str]()
+        self._time_s, self._rest_s, self._soc_range = math.nan, 0.0, (0.0, 1.0)
 
-    def add(self, voltage_v: float, current_a: float, device_ah: float) -> bool:
-        """Compare the values of a sample. Return True for those of the first sample, and the first capacity of the device.
+    def add(self, time_s: float, voltage_v: float, current_a: float, device_ah: float) -> list[str]:
+        """Compare the values of a sample. Return the lines that are new.
 
         Args:
+            time_s: Time of the sample [s].
             voltage_v: Voltage of the pack [V]; NaN: unknown.
             current_a: Current [A]; NaN: unknown.
             device_ah: Capacity that the device reports [Ah]; NaN: unknown.
         """
         has_first_capacity = math.isnan(self._device_ah) and not math.isnan(device_ah)
         is_first = not math.isnan(voltage_v) and (not self._is_compared or has_first_capacity)
-        self._device_ah = self._device_ah if math.isnan(device_ah) else device_ah
-        if is_first or (self.texts and abs(current_a) <= MAX_RESTING_C * self._cell.one_c_a):
-            lines = implausible_measurement(self._cell, voltage_v, current_a, self._device_ah)
-            settings = [line.split()[0] for line in lines]
-            self.texts = [text for text in self.texts if (text.split()[0] in settings) != is_first] + lines * is_first
-            self._is_compared = True
-        return is_first
+        self._device_ah, before = self._device_ah if math.isnan(device_ah) else device_ah, self.texts
+        rests = abs(current_a) <= MAX_RESTING_C * self._cell.one_c_a
+        self._count(time_s, current_a, rests=rests)
+        compare = functools.partial(implausible_measurement, self._cell, voltage_v, current_a, self._device_ah)
+        later = compare(self._soc_range) if self._rest_s >= MIN_REST_S else []
+        if is_first or later or (before and rests):
+            self._is_compared, known = True, {"capacity" in text: text for text in before}
+            found = {"capacity" in line: line for line in [*compare(), *later]}
+            self.texts = [
+                known.get(key, line)
+                for key, line in (known | found).items()
+                if is_first or (key in found and (key in known or line in later))
+            ]
+        return [text for text in self.texts if text not in before]
+
+    def _count(self, time_s: float, current_a: float, *, rests: bool) -> None:
+        """Change the duration of the rest, and the range of SOC by the charge since the sample before. Reset both after a gap."""
+        elapsed_s, self._time_s = time_s - self._time_s, time_s
+        change = -current_a * elapsed_s / (3600.0 * self._cell.one_c_a)
+        if not 0.0 <= elapsed_s <= MAX_GAP_S or math.isnan(change):
+            self._rest_s, self._soc_range = 0.0, (0.0, 1.0)
+            return
+        changes = change * (1.0 + CAPACITY_TOLERANCE), change / (1.0 + CAPACITY_TOLERANCE)
+        drift, (low, high) = MAX_OFFSET_C * elapsed_s / 3600.0, self._soc_range
+        self._rest_s = self._rest_s + elapsed_s if rests else 0.0
+        self._soc_range = max(low + min(changes) - drift, 0.0), min(high + max(changes) + drift, 1.0)
 
 
-def _contradictions(cell: CellModel, voltage_v: float, current_a: float, device_ah: float) -> Iterator[str]:
+def _contradictions(
+    cell: CellModel, voltage_v: float, current_a: float, device_ah: float, soc_range: tuple[float, float] | None
+) -> Iterator[str]:
     capacity_ah, series = cell.cell.capacity_ah, cell.cell.series_count
     if abs(device_ah - capacity_ah) > CAPACITY_TOLERANCE * max(device_ah, capacity_ah):
         yield f"pack.capacity_ah: the pack has {capacity_ah:g} Ah, but its device reports {device_ah:g} Ah"
     ocv_v = ocv_grid(cell)[0] / series
-    low_v, mid_v, high_v = np.interp((RESTING_SOC[0], 0.5, RESTING_SOC[1]), np.linspace(0.0, 1.0, ocv_v.size), ocv_v)
+    counted = soc_range and (min(soc_range[0], COUNTED_SOC[0]), max(soc_range[1], COUNTED_SOC[1]))
+    low_soc, high_soc = counted or RESTING_SOC
+    low_v, mid_v, high_v = np.interp((low_soc, 0.5, high_soc), np.linspace(0.0, 1.0, ocv_v.size), ocv_v)
     rests, cell_v = abs(current_a) <= MAX_RESTING_C * capacity_ah, voltage_v / series
-    if rests:
-        low_v, high_v = low_v - RESTING_V, high_v + RESTING_V
+    if soc_range:
+        low_v, high_v = low_v - COUNTED_V, high_v + (COUNTED_V if high_soc <= COUNTED_SOC[1] else ABOVE_FULL_V)
+        state = f"after a rest at an SOC of {low_soc:.2f} to {high_soc:.2f}"
+    elif rests:
+        low_v, high_v, state = (
+            low_v - RESTING_V,
+            high_v + RESTING_V,
+            "at rest, unless they were just charged or are empty",
+        )
     else:
-        low_v, high_v = ocv_v[0] - BELOW_EMPTY_V, ocv_v[-1] + ABOVE_FULL_V
+        low_v, high_v, state = ocv_v[0] - BELOW_EMPTY_V, ocv_v[-1] + ABOVE_FULL_V, "under load or charge"
     if not low_v <= cell_v <= high_v and voltage_v > 0.0:
-        state = "at rest, unless they were just charged or are empty" if rests else "under load or charge"
         yield (
             f"pack.series = {series}: {voltage_v:.2f} V are {cell_v:.2f} V a cell, but {cell.cell.name} has {low_v:.2f} to "
             f"{high_v:.2f} V {state}; {round(voltage_v / mid_v)} in series is likely, or another pack.cell"
         )
-    elif rests and mid_v >= MIN_OTHER_V and LFP_PLATEAU_V[0] <= cell_v <= LFP_PLATEAU_V[1]:
+    elif rests and not soc_range and mid_v >= MIN_OTHER_V and LFP_PLATEAU_V[0] <= cell_v <= LFP_PLATEAU_V[1]:
         yield f"pack.cell: {cell_v:.2f} V a cell is what LFP has at rest, and {cell.cell.name} is nearly empty there"
 
 
-def _battery_lines(settings: Settings, cell: CellModel) -> Iterator[str | None]:
-    """Yield one line for each implausible setting of a battery; None: the setting is plausible."""
-    checks = (
-        _too_large_capacity,
-        _series_counted_twice,
-        _implausible_cell_voltage,
-        _missing_parallel,
-        _implausible_load_cutoff,
-        _more_cells_than_series,
-    )
-    yield from (check(settings, cell) for check in checks)
-    yield _voltage_out_of_range(settings, float(ocv_grid(cell)[0][-1]), "when full")
+def _battery_lines(settings: Settings, cell: CellModel) -> Iterator[str]:
+    """Yield one line for each implausible setting of a battery."""
+    yield from _implausible_cells(settings, cell)
+    yield from _end_of_forecast_off_curve(settings, cell)
+    yield from _more_cells_than_series(settings, cell)
+    yield from _voltage_out_of_range(settings, float(ocv_grid(cell)[0][-1]), "when full")
     yield from _end_voltages_off_curve(settings, cell)
     yield from _current_limits_without_effect(settings, cell)
 
 
-def _stack_lines(settings: Settings, cell: FuelCellModel) -> Iterator[str | None]:
+def _stack_lines(settings: Settings, cell: FuelCellModel) -> Iterator[str]:
     """Yield one line for each implausible setting, and for each setting that a fuel cell ignores."""
     no_load_v, _ = polarisation(cell.a, np.zeros(LEARNABLE), np.zeros(1), np.full(1, np.nan))
-    yield _voltage_out_of_range(settings, float(no_load_v[0]), "at no load")
+    yield from _voltage_out_of_range(settings, float(no_load_v[0]), "at no load")
     if "law" in settings.observer.model_fields_set and settings.observer.law != "learning":
         yield f"observer.law = {settings.observer.law!r}: ignored: a fuel cell ({cell.cell.name}) always has 'learning'"
     if "enabled" in settings.identifier.model_fields_set and settings.identifier.enabled:
         yield f"identifier.enabled = true: ignored: the identifier is of batteries, {cell.cell.name} is a fuel cell"
 
 
-def _too_large_capacity(settings: Settings, cell: CellModel) -> str | None:
-    capacity_ah = cell.cell.capacity_ah / settings.pack.parallel
-    section = "cell" if settings.pack.capacity_ah is None else "pack"
-    text = f"{section}.capacity_ah = {capacity_ah:g}: no cell holds more than {MAX_CAPACITY_AH:g} Ah; is it in mAh?"
-    return text if capacity_ah > MAX_CAPACITY_AH else None
-
-
-def _series_counted_twice(settings: Settings, cell: CellModel) -> str | None:
-    series = settings.pack.series
-    file_series = cell.cell.series_count // series  # ``cell`` is the whole pack
-    text = (
-        f"pack.series = {series}: the cell file is of {file_series} cells in series already (series_count), which makes "
-        f"{cell.cell.series_count}; is the file the whole pack, and series 1?"
-    )
-    return text if series > 1 and file_series > 1 else None
-
-
-def _implausible_cell_voltage(_: Settings, cell: CellModel) -> str | None:
-    cell_v = cell.cell.nominal_voltage_v / cell.cell.series_count
-    text = (
-        f"{cell.cell.nominal_voltage_v:g} V nominal of {cell.cell.series_count} in series: {cell_v:.3g} V a cell, but "
-        f"Li-ion cells have {PLAUSIBLE_CELL_V[0]:g} to {PLAUSIBLE_CELL_V[1]:g} V; is series_count of the cell file right?"
-    )
-    return None if PLAUSIBLE_CELL_V[0] <= cell_v <= PLAUSIBLE_CELL_V[1] else text
-
-
-def _missing_parallel(settings: Settings, cell: CellModel) -> str | None:
-    c = cell.cell
-    is_single_row = settings.pack.parallel == 1 and c.capacity_ah <= SMALL_CELL_AH and c.series_count > MAX_SINGLE_ROW
-    text = f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
-    return text if is_single_row else None
+def _implausible_cells(settings: Settings, cell: CellModel) -> Iterator[str]:
+    """Yield a line for each implausible capacity, voltage and number of cells. ``cell`` is the whole pack."""
+    pack, c = settings.pack, cell.cell
+    capacity_ah, file_series = c.capacity_ah / pack.parallel, c.series_count // pack.series
+    cell_v = c.nominal_voltage_v / c.series_count
+    if capacity_ah > MAX_CAPACITY_AH:
+        section = "cell" if pack.capacity_ah is None else "pack"
+        yield f"{section}.capacity_ah = {capacity_ah:g}: no cell holds more than {MAX_CAPACITY_AH:g} Ah; is it in mAh?"
+    if pack.series > 1 and file_series > 1:
+        yield (
+            f"pack.series = {pack.series}: the cell file is of {file_series} cells in series already (series_count), which makes "
+            f"{c.series_count}; is the file the whole pack, and series 1?"
+        )
+    if not PLAUSIBLE_CELL_V[0] <= cell_v <= PLAUSIBLE_CELL_V[1]:
+        yield (
+            f"{c.nominal_voltage_v:g} V nominal of {c.series_count} in series: {cell_v:.3g} V a cell, but "
+            f"Li-ion cells have {PLAUSIBLE_CELL_V[0]:g} to {PLAUSIBLE_CELL_V[1]:g} V; is series_count of the cell file right?"
+        )
+    if pack.parallel == 1 and c.capacity_ah <= SMALL_CELL_AH and c.series_count > MAX_SINGLE_ROW:
+        yield f"{c.series_count} in series of {c.capacity_ah:g} Ah: a single row of small cells; is pack.parallel right?"
 
 
 def _end_voltages_off_curve(settings: Settings, cell: CellModel) -> Iterator[str]:
@@ -240,28 +275,28 @@ def _end_voltages_off_curve(settings: Settings, cell: CellModel) -> Iterator[str
             )
 
 
-def _implausible_load_cutoff(settings: Settings, cell: CellModel) -> str | None:
-    cutoff_v, ocv_v = load_cutoff_v(settings, cell), ocv_grid(cell)[0]
-    if settings.pack.cutoff_v is None:
-        return None
+def _end_of_forecast_off_curve(settings: Settings, cell: CellModel) -> Iterator[str]:
+    """Yield a line if the load is switched off while the pack is half full, or where samples are invalid."""
+    cutoff_v, ocv_v = forecast_end_v(settings, cell), ocv_grid(cell)[0]
     soc = float(np.interp(cutoff_v, ocv_v, np.linspace(0.0, 1.0, ocv_v.size)))
-    if soc <= MAX_LOAD_CUTOFF_SOC and cutoff_v >= cell.cell.voltage_min_v:
-        return None
-    return (
-        f"pack.cutoff_v = {cutoff_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there, and samples below "
-        f"{cell.cell.voltage_min_v:.4g} V are dropped as invalid (voltage_min_v); is it the voltage of the whole pack?"
-    )
+    if settings.pack.cutoff_v is not None and (soc > MAX_LOAD_CUTOFF_SOC or cutoff_v < cell.cell.voltage_min_v):
+        yield (
+            f"pack.cutoff_v = {cutoff_v:g}: the OCV of {cell.cell.name} has SOC {soc:.2f} there, and samples below "
+            f"{cell.cell.voltage_min_v:.4g} V are dropped as invalid (voltage_min_v); is it the voltage of the whole pack?"
+        )
 
 
-def _more_cells_than_series(settings: Settings, cell: CellModel) -> str | None:
-    source, series = settings.source, cell.cell.series_count
+def _more_cells_than_series(settings: Settings, cell: CellModel) -> Iterator[str]:
+    """Yield a line if the source reads more cells than are in series."""
+    source, series, count = settings.source, cell.cell.series_count, 0
     if isinstance(source, CanSource):
         count = sum(cells.count for cells in source.cells)
-    else:
-        count = source.cells.count if isinstance(source, ModbusSource) and source.cells else 0
-    if count <= series:
-        return None
-    return f"source.cells: {count} cells, but the pack has {series} in series: the others must read 0 V; is pack.series right?"
+    elif isinstance(source, ModbusSource) and source.cells:
+        count = source.cells.count
+    if count > series:
+        yield (
+            f"source.cells: {count} cells, but the pack has {series} in series: the others must read 0 V; is pack.series right?"
+        )
 
 
 def _current_limits_without_effect(settings: Settings, cell: CellModel) -> Iterator[str]:
@@ -281,12 +316,12 @@ def _current_limits_without_effect(settings: Settings, cell: CellModel) -> Itera
             )
 
 
-def _voltage_out_of_range(settings: Settings, highest_v: float, when: str) -> str | None:
+def _voltage_out_of_range(settings: Settings, highest_v: float, when: str) -> Iterator[str]:
+    """Yield a line if the board of the project cannot measure the highest voltage of the pack."""
     sensor = settings.sensor
     range_v = CONVERTER_STEPS * sensor.voltage_resolution_v
-    if sensor.protocol != "binary" or highest_v <= range_v:
-        return None
-    return (
-        f"sensor.voltage_resolution_v = {sensor.voltage_resolution_v:.4g}: the board's range ends at {range_v:.1f} V, "
-        f"but this pack has {highest_v:.1f} V {when}; it needs another divider, and its resolution here"
-    )
+    if sensor.protocol == "binary" and highest_v > range_v:
+        yield (
+            f"sensor.voltage_resolution_v = {sensor.voltage_resolution_v:.4g}: the board's range ends at {range_v:.1f} V, "
+            f"but this pack has {highest_v:.1f} V {when}; it needs another divider, and its resolution here"
+        )

@@ -27,7 +27,8 @@ from bms_estimator.kernels.observer.nussbaum import Nussbaum
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.arrays import Floats, Records, exp
-from bms_estimator.model.cell import CellModel, ChenMoraOcv, Rated
+from bms_estimator.model.cell import CellModel, Rated
+from bms_estimator.model.cell_sections import ChenMoraOcv
 from bms_estimator.model.monotone_cubic import MonotoneCubic
 from bms_estimator.model.pack_model import FuelCellModel, PackModel
 from bms_estimator.settings.observer import (

@@ -6,7 +6,8 @@ Numbers in parentheses are equations of the thesis.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from bms_estimator.model.cell import Bounds, CellModel
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import Bounds
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.observer import ObserverSettings
 

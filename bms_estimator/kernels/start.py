@@ -25,7 +25,7 @@ from bms_estimator.kernels.kalman_filter.hypotheses import (
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, limit_soc_std, merge_all
 from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
-from bms_estimator.kernels.kalman_filter.temperature import is_temperature, update_arrhenius_factors
+from bms_estimator.kernels.kalman_filter.temperature import update_arrhenius_factors
 from bms_estimator.kernels.kalman_filter.window import add_to_window, prepare_transition, reset_window
 from bms_estimator.kernels.observer.learning_law import initialize_learning, initialize_states_at_rest
 from bms_estimator.kernels.observer.series_resistance import (
@@ -36,6 +36,10 @@ from bms_estimator.numba_cache import njit
 
 MAX_SOC_STD_AFTER_GAP = 0.3
 """Maximum std of the SOC after an unmeasured gap."""
+MIN_PLAUSIBLE_C = -60.0
+"""Lowest plausible temperature of a cell [C]."""
+MAX_PLAUSIBLE_C = 120.0
+"""Highest plausible temperature of a cell [C]."""
 
 
 @njit(cache=True)
@@ -108,8 +112,7 @@ def first_update(s: Record, p: Record, current_a: float, voltage_v: float) -> No
 @njit(cache=True)
 def initialize_state(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """Initialize filter, learning law and sums of R_s at the first sample."""
-    s.learning.temperature_c = math.nan
-    store_temperature(s.learning, temperature_c)
+    s.learning.temperature_c = temperature_c
     if p.identify:
         start_filter(s, p, current_a, voltage_v, temperature_c)
     if p.learning.enabled:
@@ -119,17 +122,22 @@ def initialize_state(s: Record, p: Record, current_a: float, voltage_v: float, t
 
 
 @njit(cache=True)
-def store_temperature(m: Record, temperature_c: float) -> None:
-    """Store a plausible temperature in ``m``, a record of LEARNING_STATE."""
-    if is_temperature(temperature_c):
-        m.temperature_c = temperature_c
+def plausible_temperature(m: Record, temperature_c: float) -> float:
+    """Return a plausible temperature [C], which is stored in ``m``, or NaN. ``m`` is a record of LEARNING_STATE.
+
+    Sensors with an open wire report -127 or -300 C.
+    """
+    if not MIN_PLAUSIBLE_C <= temperature_c <= MAX_PLAUSIBLE_C:
+        return math.nan
+    m.temperature_c = temperature_c
+    return temperature_c
 
 
 @njit(cache=True)
 def restart_after_unknown_gap(s: Record, p: Record, current_a: float, voltage_v: float, temperature_c: float) -> None:
     """Restart at the first sample with a new time base, after a gap of unknown duration."""
     if p.identify:
-        if is_temperature(temperature_c):
+        if math.isfinite(temperature_c):
             s.filter.temperature_c, s.filter.sensed = temperature_c, 1
         elif not s.filter.sensed:
             s.filter.temperature_c = REFERENCE_C

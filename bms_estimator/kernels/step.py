@@ -21,7 +21,7 @@ from bms_estimator.kernels.observer.series_resistance import (
     series_resistance_step,
 )
 from bms_estimator.kernels.stability_margin import is_delta_configured, margin_with_std
-from bms_estimator.kernels.start import initialize_state, restart_after_unknown_gap, store_temperature
+from bms_estimator.kernels.start import initialize_state, plausible_temperature, restart_after_unknown_gap
 from bms_estimator.model.arrays import Record, Records, SampleStatus
 from bms_estimator.numba_cache import njit
 
@@ -114,12 +114,12 @@ def process_sample(
     if is_doubtful(s, p.observer, time_s - o.time_s, current_a, voltage_v, status):
         return _CONTRADICTED
     o.samples += 1
+    temperature_c = plausible_temperature(s.learning, temperature_c)
     if not o.started:
         set_reference(s.current_check, current_a, voltage_v, 0)
         initialize(o, p.observer, time_s, current_a, voltage_v)
         initialize_state(s, p, current_a, voltage_v, temperature_c)
         return outcome
-    store_temperature(s.learning, temperature_c)
     dt_s = time_s - o.time_s
     pending = s.pending
     if status & _CURRENT_HELD and dt_s > 0.0:

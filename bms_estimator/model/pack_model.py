@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from bms_estimator.model.cell import (
-    ELEMENTS,
     CellModel,
     Rated,
     Result,
@@ -25,6 +24,7 @@ from bms_estimator.model.cell import (
     load_cell,
     shipped_fuel_cells,
 )
+from bms_estimator.model.cell_sections import ELEMENTS
 from bms_estimator.model.config_file import NotNegative, Positive, Strict, read_toml, write_text
 from bms_estimator.model.errors import UserError
 

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.systemd import credential_path
-from bms_estimator.settings.outputs import BrokerSettings
+from bms_estimator.settings.connections import BrokerSettings
 
 MAX_WAITING = 100
 """Default of ``ConnectOptions.max_waiting``."""

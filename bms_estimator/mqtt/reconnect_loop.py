@@ -32,7 +32,7 @@ from bms_estimator.mqtt.connection import (
     tls_context,
 )
 from bms_estimator.process.runtime import FIRST_DELAY_S, MAX_DELAY_S, Backoff
-from bms_estimator.settings.outputs import BrokerSettings
+from bms_estimator.settings.connections import BrokerSettings
 
 
 class BrokerConnector:

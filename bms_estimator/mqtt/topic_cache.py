@@ -26,7 +26,7 @@ from bms_estimator.mqtt.connection import (
 )
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import FIRST_DELAY_S, finish
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.pack import DEVICE_NAME
 
 MAX_DEVICES = 64

@@ -11,7 +11,7 @@ from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import Estimator, TraceBlock, compiled_estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.estimator.restore import restore_state
-from bms_estimator.estimator.settings_plausibility import load_cutoff_v
+from bms_estimator.estimator.settings_plausibility import forecast_end_v
 from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows, power_limits
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.load_history import load_arrays, restore_load
@@ -337,7 +337,7 @@ def assemble(
         slow_fit = new_fit(estimator, settings.identifier.fit_interval_s or FIT_INTERVAL_S)
     if has_load and estimator.has_filter:
         cell = estimator.cell.battery("the identifier is of batteries")
-        forecaster = Forecaster(estimator, cutoff_v=load_cutoff_v(settings, cell), limits=power_limits(settings, cell))
+        forecaster = Forecaster(estimator, cutoff_v=forecast_end_v(settings, cell), limits=power_limits(settings, cell))
     device_soc_std = settings.pack.device_soc_std if estimator.has_filter else None
     return Pack(
         estimator,

@@ -16,12 +16,15 @@ from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.kernels.pack_voltage import RESISTANCE_GROUPS
 from bms_estimator.model.arrays import Floats, exp
 from bms_estimator.pack_model.cell_curves import SOC_GRID, CellCurves
-from bms_estimator.pack_model.fit import CURVE as FIT_CURVE
-from bms_estimator.pack_model.fit import LN_Q as FIT_LN_Q
-from bms_estimator.pack_model.fit import LN_R as FIT_LN_R
-from bms_estimator.pack_model.fit import NODE_SOC, PackFit
-from bms_estimator.pack_model.fit import OFFSET as FIT_OFFSET
-from bms_estimator.pack_model.fit import SOC as FIT_SOC
+from bms_estimator.pack_model.fit import (
+    CURVE as FIT_CURVE,
+    LN_Q as FIT_LN_Q,
+    LN_R as FIT_LN_R,
+    NODE_SOC,
+    OFFSET as FIT_OFFSET,
+    SOC as FIT_SOC,
+    PackFit,
+)
 from bms_estimator.pack_model.intervals import HOUR_S
 
 MIN_CURVE_STD_V = 0.003

@@ -14,8 +14,7 @@ from bms_estimator.kernels.kalman_filter.hypotheses import MAX_STD_OF_ONE_HYPOTH
 from bms_estimator.pack_model.accuracy import with_soc_bound
 from bms_estimator.pack_model.bank_monitor import BankMonitor
 from bms_estimator.pack_model.cell_curves import CellCurves
-from bms_estimator.pack_model.fit import SOC as FIT_SOC
-from bms_estimator.pack_model.fit import PackFit, fit
+from bms_estimator.pack_model.fit import SOC as FIT_SOC, PackFit, fit
 from bms_estimator.pack_model.handover import adopt_state, use_fitted_curves
 from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.resume import resume_history

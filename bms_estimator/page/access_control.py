@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.process.systemd import credential_path
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 
 MIN_TOKEN_CHARACTERS = 16
 """Minimum length of a token [characters]; `openssl rand -hex 16` generates 32."""

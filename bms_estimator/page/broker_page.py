@@ -8,7 +8,7 @@ from bms_estimator.mqtt.topic_cache import DeviceMessage, Subscriber
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer
-from bms_estimator.settings.outputs import MqttSettings, PageSettings
+from bms_estimator.settings.connections import MqttSettings, PageSettings
 
 
 @contextlib.asynccontextmanager

@@ -11,7 +11,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.page.history_query import SPANS, HistoryQuery
 from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.web_server import File, WebServer
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.sinks.mqtt.requests import MAX_READ_BYTES
 
 HISTORY_TIMEOUT_S = 10.0

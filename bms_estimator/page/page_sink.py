@@ -12,7 +12,7 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.page.history_query import HistoryQuery
 from bms_estimator.page.pack_topics import EVENT, STATE, PackTopics
 from bms_estimator.page.page_server import ForecastHandler, PageServer
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, changed_payloads
 
 

@@ -16,7 +16,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.page.access_control import HEADERS, AccessControl, make_access_control
 from bms_estimator.page.event_stream import LatestValues, Reader
 from bms_estimator.process.listener import CONNECTIONS, Listener
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 
 PING_S = 5.0
 """Interval of keep-alive events without news [s]. The page counts the connection as lost after three intervals of silence."""

@@ -11,7 +11,8 @@ import numpy as np
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, c_tl, c_ts, delta, r_s, r_tl, r_ts
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, TableOcv
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.plot.style import (
     BAND_LABEL,
     COLORS,

@@ -1,4 +1,4 @@
-"""Runtime of a long-running process: log on stderr, signals, delays before retries, and ending of tasks."""
+"""Runtime of a long-running process: log on stderr, signals, delays before retries, and ending of tasks by cancellation."""
 
 import asyncio
 import contextlib
@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Coroutine, Iterator, MutableMapping, MutableSequence
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import structlog
 from structlog.processors import ExceptionRenderer
@@ -17,6 +17,8 @@ from structlog.tracebacks import ExceptionDictTransformer
 from bms_estimator.process.stderr_writer import stderr
 from bms_estimator.settings.pack import LogLevel
 
+Result = TypeVar("Result")
+"""Result of a coroutine."""
 LEVELS: tuple[LogLevel, ...] = get_args(LogLevel)
 _levels: dict[str, LogLevel] = {}
 """Log levels by pack."""
@@ -135,7 +137,7 @@ def exit_on_startup_signals() -> Iterator[None]:
     An ignored SIGHUP stays ignored, as under nohup.
     """
     unignored = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) is signal.SIG_DFL]
-    previous_handlers = {number: signal.signal(number, _end) for number in unignored}
+    previous_handlers = {number: signal.signal(number, _exit_process) for number in unignored}
     try:
         yield
     finally:
@@ -143,25 +145,20 @@ def exit_on_startup_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _end(*_: object) -> None:
+def _exit_process(*_: object) -> None:
     """End the process without an exception, because an exception may be lost in numba's compiler.
 
     The exit runs in a thread, because the interrupted code may hold the lock of the log.
     """
 
-    def end() -> None:
+    def exit_process() -> None:
         log.info("asked to end before samples were taken")
         stderr.drain()
         os._exit(0)
 
-    threading.Thread(target=end, daemon=True).start()
+    threading.Thread(target=exit_process, daemon=True).start()
 
 
-FIRST_RETRY_S = 0.5
-"""First retry delay of a missing or lost port; it doubles with each attempt [s]."""
-
-MAX_RETRY_S = 10.0
-"""Maximum retry delay of a missing or lost port [s]."""
 FIRST_DELAY_S = 2.0
 """First delay of a ``Backoff``; it doubles with each attempt [s]."""
 MAX_DELAY_S = 30.0
@@ -195,7 +192,7 @@ CANCEL_INTERVAL_S = 0.1
 """Interval at which a task that ignores cancellation is cancelled again [s]."""
 
 
-async def end(*tasks: asyncio.Future[Any]) -> None:
+async def end_tasks(*tasks: asyncio.Future[Any]) -> None:
     """Cancel tasks repeatedly until all have ended. They must not contain work that has to be finished.
 
     Some libraries, and wait_for of Python 3.11, may swallow a cancellation.
@@ -222,13 +219,24 @@ async def finish(task: asyncio.Task[None], timeout_s: float) -> None:
         await task
 
 
+async def result_before(stop: asyncio.Event, coroutine: Coroutine[Any, Any, Result]) -> Result | None:
+    """Return the result of a coroutine; None if ``stop`` is set before, which cancels it."""
+    task = asyncio.ensure_future(coroutine)
+    try:
+        # a stop cancels only ``asyncio.wait``; therefore the task is done only if it has a result or an error
+        await until_first_ends(asyncio.wait([task]), stop.wait())
+    finally:
+        await end_tasks(task)
+    return None if task.cancelled() else task.result()
+
+
 async def until_first_ends(*coroutines: Coroutine[Any, Any, Any]) -> None:
     """Run coroutines until one ends, cancel the others, and raise the first exception of any of them."""
     tasks = [asyncio.ensure_future(coroutine) for coroutine in coroutines]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        await end(*tasks)
+        await end_tasks(*tasks)
     for task in tasks:
         if not task.cancelled() and (error := task.exception()):
             raise error

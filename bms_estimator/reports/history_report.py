@@ -22,15 +22,14 @@ from bms_estimator.plot.style import (
     thin,
     widen,
 )
+from bms_estimator.reports.aging_group import AgingHistory, aging_group
 from bms_estimator.reports.report_parts import (
     DAY_S,
     MINUTE_S,
-    AgingHistory,
     Group,
     Plot,
     ReportPage,
     Section,
-    aging_group,
     duration_text,
     number,
     small_plot,

@@ -21,7 +21,7 @@ from numba import from_dtype, types
 
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.numba_cache import CACHE_FOLDER, SHIPPED_FOLDER
-from bms_estimator.process.host import anonymous_bytes, available_bytes
+from bms_estimator.process.memory import anonymous_bytes, available_bytes
 from bms_estimator.process.systemd import extend_start
 
 ORDER_FILE = Path(__file__).with_name("compile_order.txt")

@@ -22,9 +22,9 @@ from bms_estimator.service.kernel_compilation import compile_kernels
 from bms_estimator.settings.alarm_limits import MIN_CELLS
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter, Window
+from bms_estimator.telemetry.state import remaining_capacity_ah
 
 CELL = "chen_mora"
 """Cell file of the warm-up. Any file would do, because the kernels do not depend on the cell."""

@@ -244,10 +244,9 @@ async def _estimate(
     """
     logged_reason, before_s, contradictions = "", begin_s, Contradictions(pack.model)
     async for each in source:
-        for voltage_v, current_a in each.samples[-1:][["voltage_v", "current_a"]].tolist():
-            if contradictions.add(voltage_v, current_a, each.device_capacity_ah):
-                for text in contradictions.texts:
-                    log.warning("implausible setting", reason=text)
+        for time_s, voltage_v, current_a in each.samples[-1:][["time_s", "voltage_v", "current_a"]].tolist():
+            for text in contradictions.add(time_s, voltage_v, current_a, each.device_capacity_ah):
+                log.warning("implausible setting", reason=text)
         status.contradictions = contradictions.texts
         received = each._replace(cells_v=slots.select(each.cells_v))
         if slots.reason != logged_reason:

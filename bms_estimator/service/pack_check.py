@@ -10,7 +10,7 @@ from bms_estimator.page.access_control import make_access_control
 from bms_estimator.process.systemd import is_unreadable_credential
 from bms_estimator.service.hook_check import hook_warnings
 from bms_estimator.settings.alarm_limits import implausible_limits
-from bms_estimator.settings.outputs import EdgeSettings, InfluxSettings, MqttSettings, PageSettings
+from bms_estimator.settings.connections import EdgeSettings, InfluxSettings, MqttSettings, PageSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.exports.influx import target
 from bms_estimator.sources.factory import make_line_producer

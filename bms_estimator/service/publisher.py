@@ -18,7 +18,7 @@ from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.source import ReceivedSamples, Source
 from bms_estimator.telemetry.alarms.definitions import Change
-from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload, remaining_capacity_ah
+from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload
 from bms_estimator.telemetry.health import (
     DEVICE_SOC_SUSPICION,
     contradicts_device,
@@ -43,6 +43,7 @@ from bms_estimator.telemetry.state import (
     make_info_payload,
     make_state_payload,
     no_forecast,
+    remaining_capacity_ah,
 )
 
 log = structlog.get_logger(__name__)

@@ -6,7 +6,7 @@ from typing import Annotated, Self
 from pydantic import AwareDatetime, Field, model_validator
 
 from bms_estimator.model.config_file import Strict
-from bms_estimator.settings.outputs import Address, ListenAddress, parse_listen
+from bms_estimator.settings.connections import Address, ListenAddress, parse_listen
 from bms_estimator.settings.pack import DeviceName
 
 Gigabytes = Annotated[float, Field(gt=0, le=1e6)]

@@ -14,8 +14,7 @@ from bms_estimator.model.config_file import Fraction, Positive, Strict, read_tom
 from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.registry import max_batteries
 from bms_estimator.settings.alarms import AlarmSettings
-from bms_estimator.settings.observer import ChargeLimits, IdentifierSettings, ObserverSettings, Sampling
-from bms_estimator.settings.outputs import (
+from bms_estimator.settings.connections import (
     EdgeSettings,
     HomeAssistantSettings,
     InfluxSettings,
@@ -23,6 +22,7 @@ from bms_estimator.settings.outputs import (
     PageSettings,
     PrometheusSettings,
 )
+from bms_estimator.settings.observer import ChargeLimits, IdentifierSettings, ObserverSettings, Sampling
 from bms_estimator.settings.sensor import ALLOWED_WITH_SOURCE, SensorSettings
 from bms_estimator.settings.settings_template import GivenSettings, settings_file
 from bms_estimator.settings.sources.fieldbus import CanSource, ModbusSource

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from bms_estimator.model.decimal_text import number
-from bms_estimator.settings.outputs import DEFAULT_LISTEN
+from bms_estimator.settings.connections import DEFAULT_LISTEN
 from bms_estimator.settings.settings_template import GivenSettings
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.found_device import FoundDevice

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable
-from typing import Self
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel
@@ -11,6 +10,7 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings
 from bms_estimator.setup.measurement import first_sample_timeout_s
+from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources.factory import open_source
 from bms_estimator.telemetry.state import UNKNOWN_SOC
 
@@ -18,7 +18,7 @@ MAX_RESTING_C = 0.1
 """Current relative to the capacity [1/h]. Above it, the overvoltage makes the first estimate inexact."""
 
 
-class EstimateSink:
+class EstimateSink(Sink):
     """Sink that passes each estimate to a function.
 
     Args:
@@ -27,10 +27,6 @@ class EstimateSink:
 
     def __init__(self, on_estimate: Callable[[Estimate], object]) -> None:
         self._on_estimate = on_estimate
-
-    async def __aenter__(self) -> Self:
-        """Return the sink."""
-        return self
 
     async def __aexit__(self, *_: object) -> None:
         """Do nothing, because the sink holds no resources."""
@@ -93,6 +89,8 @@ def load_note(current_a: float, capacity_ah: float) -> str:
         current_a: Present current [A].
         capacity_ah: Capacity of the pack [Ah].
     """
-    if abs(current_a) <= MAX_RESTING_C * capacity_ah:
-        return ""
-    return "A first estimate under load is inexact, and may lie outside its band; it becomes better at rest."
+    return (
+        "A first estimate under load is inexact, and may lie outside its band; it becomes better at rest."
+        if abs(current_a) > MAX_RESTING_C * capacity_ah
+        else ""
+    )

@@ -12,7 +12,7 @@ from bms_estimator.model.config_file import parse_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.listener import is_free
 from bms_estimator.service.pack_check import check_settings, summarize
-from bms_estimator.settings.outputs import DEFAULT_LISTEN, parse_listen
+from bms_estimator.settings.connections import DEFAULT_LISTEN, parse_listen
 from bms_estimator.settings.pack import Settings, create_pack_file
 from bms_estimator.settings.settings_template import settings_file
 from bms_estimator.setup.answers import Answers

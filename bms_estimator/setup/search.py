@@ -1,6 +1,7 @@
 """Search for devices: serial ports, MQTT publishers, Modbus, Bluetooth."""
 
 import asyncio
+import contextlib
 import importlib.util
 import secrets
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, LoginError, brokers, check
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.settings.sources.fieldbus import MODBUS_PROFILES
 from bms_estimator.setup.broker_login import BrokerLogin
@@ -136,13 +137,11 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
             if denied:
                 result.failures.append(f"{url}: not allowed to read #: {denied['#']}")
                 return
-            try:
+            with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LISTEN_DURATION_S):
                     while True:
                         message = await connection.receive()
                         recognition.add_message(message.topic, message.payload, retained=message.retain)
-            except TimeoutError:
-                pass
     except LoginError:
         reason = "requires a user name and a password" if login.username is None else "user name or password wrong"
         result.failures.append(f"{url}: {reason}; give them as {url.replace('://', '://user:pw@')}")
@@ -178,8 +177,9 @@ async def _search_modbus_host(place: str, result: SearchResult) -> None:
 async def _search_modbus(address: dict[str, object], name: str, result: SearchResult) -> None:
     if importlib.util.find_spec("pymodbus") is None:
         if "host" in address:  # a serial port is reported already
-            remedy = f"pip install 'bms_estimator[modbus]'; {BROKER_HINT}"
-            result.failures.append(f"{name}: Modbus was not searched: {remedy}")
+            result.failures.append(
+                f"{name}: Modbus was not searched: pip install 'bms_estimator[modbus]'; {BROKER_HINT}"
+            )
         return
     is_serial = "port" in address
     profiles = [name for name, table in MODBUS_PROFILES.items() if not is_serial or "baud" in table]

@@ -8,7 +8,7 @@ from typing import Self
 
 from bms_estimator.mqtt.connection import Connection, ConnectOptions, DeliveryStats, Message, brokers
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.simulation.virtual_adc import Reading
 
 INTERVAL_S = 2.0

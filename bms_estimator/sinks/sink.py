@@ -12,7 +12,8 @@ class Sink(Protocol):
         """Publish a snapshot. The method neither waits for the receiver nor raises an error if the receiver is down."""
 
     async def __aenter__(self) -> Self:
-        """Start publishing."""
+        """Start publishing; return the sink."""
+        return self
 
     async def __aexit__(self, *_: object) -> None:
         """Send queued messages and stop."""

@@ -5,14 +5,18 @@ import contextlib
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterator,
+    Callable,
+    Mapping,
+)
 from typing import NamedTuple, Protocol, Self
 
 import structlog
 
 from bms_estimator.model.arrays import NO_PROBES, NO_SOC, CellBlock, Floats, ProbeBlock, SampleBlock
 from bms_estimator.model.clock import since_boot
-from bms_estimator.process.runtime import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.protocols.base.reading import CONNECTED
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
@@ -20,6 +24,10 @@ from bms_estimator.sources.fault_log import FaultLog, SilenceLog
 
 Chunk = tuple[float, bytes]
 """Arrival time [s since 1970] and bytes of one read."""
+FIRST_RETRY_S = 0.5
+"""First retry delay of a missing or lost device; it doubles with each attempt [s]."""
+MAX_RETRY_S = 10.0
+"""Maximum retry delay of a missing or lost device [s]."""
 
 
 class SourceHealth(NamedTuple):

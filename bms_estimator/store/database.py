@@ -160,7 +160,7 @@ class _File:
         self._connection: sqlite3.Connection | None = None
         self._inode = (0, 0)
         self._ready = False  # the schema was checked
-        self._synced_s = 0.0
+        self._synced_s = -math.inf
         self.open_count = 0
 
     def run(self, work: Callable[[sqlite3.Connection], Result]) -> Result:

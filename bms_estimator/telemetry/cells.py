@@ -1,4 +1,4 @@
-"""Values of single cells: payload of the topic ``cells``, columns of a table of estimates, and inputs of the alarms; and the weakest cell."""
+"""Values of single cells and of the weakest one: payload of the topic ``cells``, columns of a table, and inputs of the alarms."""
 
 import math
 from typing import Any, NamedTuple
@@ -6,33 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bms_estimator.estimator.cell_estimator import CellDeviations
-from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.kernels.cells.records import ReadingFault
 from bms_estimator.model.arrays import Records
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.snapshot import CellFaultName, CellReport, CellsReport
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.bank_comparison import ComparedCell
-from bms_estimator.telemetry.state import finite
-
-
-def remaining_capacity_ah(estimator: Estimator) -> float:
-    """Return the charge down to SOC 0 [Ah]; NaN before the first sample.
-
-    Args:
-        estimator: Estimator; read only.
-    """
-    state = estimator.state[0]
-    if not state["started"] or math.isnan(state["soc"]):
-        return math.nan
-    return float(state["soc"]) * full_capacity_ah(estimator)
-
-
-def full_capacity_ah(estimator: Estimator) -> float:
-    """Return the capacity [Ah] that the identifier has learned, after a sample; without an identifier, the declared capacity."""
-    ratio = relative_capacity(estimator.record[0]).value if estimator.has_filter else 1.0
-    return ratio * float(estimator.settings["capacity_as"][0]) / 3600.0
+from bms_estimator.telemetry.state import finite, full_capacity_ah
 
 
 class WeakestCell(NamedTuple):

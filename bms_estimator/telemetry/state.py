@@ -1,4 +1,4 @@
-"""Payloads of the topics ``state``, ``info`` and ``forecast``, and the text of a cut-off."""
+"""Payloads of the topics ``state``, ``info`` and ``forecast``, the text of a cut-off, and the pack's capacity."""
 
 import math
 from collections.abc import Mapping
@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from bms_estimator.estimator.estimator import Estimator
+from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.available_power import FORECAST, Forecast, unknown_values
 from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import Floats, ProbeBlock
@@ -283,3 +285,21 @@ def make_info_payload(
         publish_rate_hz=settings.publish.rate_hz,
         board=dict(board),
     )
+
+
+def remaining_capacity_ah(estimator: Estimator) -> float:
+    """Return the charge down to SOC 0 [Ah]; NaN before the first sample.
+
+    Args:
+        estimator: Estimator; read only.
+    """
+    state = estimator.state[0]
+    if not state["started"] or math.isnan(state["soc"]):
+        return math.nan
+    return float(state["soc"]) * full_capacity_ah(estimator)
+
+
+def full_capacity_ah(estimator: Estimator) -> float:
+    """Return the capacity [Ah] that the identifier has learned, after a sample; without an identifier, the declared capacity."""
+    ratio = relative_capacity(estimator.record[0]).value if estimator.has_filter else 1.0
+    return ratio * float(estimator.settings["capacity_as"][0]) / 3600.0

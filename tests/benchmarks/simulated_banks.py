@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 import bms_estimator
 from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.fit import PackFit, fit

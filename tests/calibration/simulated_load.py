@@ -6,7 +6,8 @@ from scipy.signal import lfilter
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, simulate_cell
 from bms_estimator.model.arrays import SAMPLE
-from bms_estimator.model.cell import ELEMENTS, CellModel, Ladder, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import ELEMENTS, Ladder
 
 TRUTH = load_cell("ncr18650").model_copy(update={"ladder": None})
 """True cell with two RC pairs, equations (2.2)-(2.9) of the thesis."""

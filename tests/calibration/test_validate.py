@@ -7,7 +7,8 @@ from bms_estimator.calibration.validate import soc_errors, validate
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, arrhenius
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault

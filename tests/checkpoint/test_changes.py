@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.arrays_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_BASE_AGE_S, MAX_SOC_CHANGE
+from bms_estimator.checkpoint.changes_file import BLOCK_BYTES, CHANGES_SUFFIXES, MAX_BASE_AGE_S, MAX_SOC_CHANGE
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.kalman_filter.records import SCRATCH
 from bms_estimator.model.arrays import fields
-from bms_estimator.process.host import BootTimestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, learned_estimator
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields
 
-from bms_estimator.checkpoint.arrays_file import pack_identity
+from bms_estimator.checkpoint.identity import pack_identity
 from bms_estimator.checkpoint.state_files import FORMAT, MAX_FILES, CheckpointFile, StateFiles
 from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.estimator.restore import restore_state

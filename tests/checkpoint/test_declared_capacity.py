@@ -12,7 +12,7 @@ from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.pack_model import slow_fit as slow_fit_module
-from bms_estimator.process.host import BootTimestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp
 from bms_estimator.settings.pack import Settings
 from tests.pack_model.quick_fit import LN_CAPACITY, quick_fit
 from tests.simulated_pack import CAPACITY_AH, CELLS, SimulatedPack

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bms_estimator.checkpoint.arrays_file import observer_identity, pack_identity
+from bms_estimator.checkpoint.identity import observer_identity, pack_identity
 from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.fleet.packs.pack_type import config_digest
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.pack_model import PackModel, load_model
-from bms_estimator.process.host import BootTimestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp
 from bms_estimator.settings.pack import Settings
 
 CHECKPOINT_FILE = Path(__file__).with_name("checkpoint_format_7.npz")

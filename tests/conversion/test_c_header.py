@@ -9,7 +9,8 @@ import pytest
 
 from bms_estimator.conversion.circuit import c_header, ladder_table
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import Ladder, TableOcv
 from tests.conversion.load import INITIAL_SOC, difference_mv, load_profile
 
 STEP_FOLDER = Path(__file__).parents[2] / "docs" / "cell"

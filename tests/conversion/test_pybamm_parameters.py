@@ -10,7 +10,8 @@ import pytest
 
 from bms_estimator.conversion.json_and_pybamm import pybamm_module
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from tests.conversion.load import INITIAL_SOC, STEP_S, difference_mv, load_profile
 
 MAX_STEP_MV = 1.0

@@ -18,7 +18,7 @@ OVERLAYS = ("/usr", "/var/lib/dpkg")
 """Folders of this machine: its programs and the list of its packages. The container's changes to them end with it."""
 CLOCK_PROGRAM = """#!/usr/lib/bms-estimator/bin/python3
 import ctypes
-from bms_estimator.process.host import is_clock_synchronized
+from bms_estimator.process.boot_timestamp import is_clock_synchronized
 print("clock", ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512)), is_clock_synchronized(), flush=True)
 """
 """Program that prints the clock's state as seen in the service's sandbox."""

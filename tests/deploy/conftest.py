@@ -26,6 +26,17 @@ def find_program() -> Callable[[str], str]:
     return find
 
 
+@pytest.fixture(scope="session")
+def systemd_nspawn() -> str:
+    """Return the path of the program that boots containers. It skips the test where it cannot be used."""
+    path = "/usr/bin/systemd-nspawn"
+    if not os.access(path, os.X_OK):
+        pytest.skip("systemd-nspawn is not installed (apt install systemd-container)")
+    if os.geteuid() != 0:
+        pytest.skip("only root can boot a container")
+    return path
+
+
 @pytest.fixture
 def deploy() -> Path:
     """Return the folder with the files to deploy."""

@@ -26,13 +26,8 @@ pytestmark = [pytest.mark.thorough, pytest.mark.timeout(2 * BOOT_S)]
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory) -> dict[str, str]:
+def report(tmp_path_factory, systemd_nspawn) -> dict[str, str]:
     """Return the parts of the container's report by name."""
-    systemd_nspawn = "/usr/bin/systemd-nspawn"
-    if not os.access(systemd_nspawn, os.X_OK):
-        pytest.skip("systemd-nspawn is not installed (apt install systemd-container)")
-    if os.geteuid() != 0:
-        pytest.skip("only root can boot a container")
     for name in ("mosquitto", "mosquitto_sub"):
         if shutil.which(name, path="/usr/bin:/usr/sbin") is None:
             pytest.skip(f"{name} is not installed (apt install mosquitto mosquitto-clients)")

@@ -1,8 +1,7 @@
 """Division of samples into blocks: each sample is in one block, in order."""
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.edge.batching import Batcher
 from bms_estimator.model.arrays import SAMPLE, SampleBlock

@@ -14,7 +14,7 @@ from bms_estimator.model.arrays import NO_CELLS, SAMPLE, CellBlock, SampleBlock
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.health import EdgeHealth
-from bms_estimator.settings.outputs import EdgeSettings
+from bms_estimator.settings.connections import EdgeSettings
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.mosquitto import Broker, Listener
@@ -104,12 +104,12 @@ async def test_samples_arrive_in_blocks_of_a_minute_and_the_rest_arrives_at_shut
     async with simulated.edge:
         simulated.add(30.5)
         await receiver.wait_for_samples(30 * 60)
-        await until(lambda: simulated.edge.store.position(PACK).oldest > 20)  # the worker has confirmed 20 blocks
+        await until(lambda: simulated.edge.queue.position(PACK).oldest > 20)  # the worker has confirmed 20 blocks
     await simulated.assert_all_received()
     assert [block.number for block in receiver.blocks] == list(range(1, 32))
     assert {block.samples.size for block in receiver.blocks[:-1]} == {60}
     assert receiver.blocks[-1].arrival_s == WALL_S + simulated.now_s - 1.0
-    assert (receiver.resends, receiver.gaps, simulated.edge.store.dropped) == (0, 0, 0)
+    assert (receiver.resends, receiver.gaps, simulated.edge.queue.dropped) == (0, 0, 0)
 
 
 async def test_no_sample_is_lost_when_the_connection_is_cut(
@@ -123,7 +123,7 @@ async def test_no_sample_is_lost_when_the_connection_is_cut(
             for _ in range(3):
                 network.disconnect_network()
                 simulated.add(40)
-                await until(lambda: not simulated.edge.store.connected)
+                await until(lambda: not simulated.edge.queue.connected)
                 network.rejects_connections = False
                 simulated.add(1)
                 await simulated.assert_all_received()
@@ -138,11 +138,11 @@ async def test_samples_keep_their_period_if_a_new_store_begins_later_than_the_wa
         simulated.add(2)
         # a worker that has received blocks of a later store makes the edge begin a store that is later still
         later = BlockRequest(store=int(WALL_S + 1e8) * 10**9, number=7, resend=False)
-        await until(lambda: simulated.edge.store.position(PACK).next_number == 2)  # the first block is on disk
-        simulated.edge.store.on_request(PACK, later)
+        await until(lambda: simulated.edge.queue.position(PACK).next_number == 2)  # the first block is on disk
+        simulated.edge.queue.on_request(PACK, later)
         simulated.add(4)
         async with asyncio.timeout(LONG_S):
-            first, second, third = [decode((await simulated.edge.store.take(1))[0].message.payload) for _ in range(3)]
+            first, second, third = [decode((await simulated.edge.queue.take(1))[0].message.payload) for _ in range(3)]
     assert (first.number, first.store_created_ns > later.store) == (1, True)
     assert (first.samples["time_s"] == 0.0).all()  # they were timestamped before the request
     assert second.samples["time_s"].tolist() == [*np.arange(60.0)]
@@ -213,7 +213,7 @@ async def test_blocks_are_sent_to_any_mqtt_broker(broker: Broker, tmp_path: Path
         resent = decode(await listener.wait("raw/pack", skip=message_count))
         await listener.wait("raw/pack", lambda data: decode(data).number == 9, skip=message_count)
         assert (resent.number, resent.oldest) == (7, 7)
-        await until(lambda: not edge.store.waiting)  # the broker's acknowledgement may arrive later
+        await until(lambda: not edge.queue.waiting)  # the broker's acknowledgement may arrive later
         assert edge.health() == EdgeHealth(blocks_kept=3, blocks_unsent=0, blocks_dropped=0, trouble=None)
 
 

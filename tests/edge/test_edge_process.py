@@ -14,7 +14,7 @@ import pytest
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.model.cell import load_cell
 from bms_estimator.service.pack_service import run_pack_service
-from bms_estimator.settings.outputs import EdgeSettings
+from bms_estimator.settings.connections import EdgeSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.health import sample_counters
 from tests.command_line import PROGRAM, run, running_program

@@ -4,10 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bms_estimator.edge.block_sender import DEAD_BAND_S, GRID, SLEW, STEP_S, WINDOW_S, SampleClock
+from bms_estimator.edge.sample_clock import DEAD_BAND_S, GRID, SLEW, STEP_S, WINDOW_S, SampleClock
 
 WALL_S = 1.7e9
 """Wall clock at the start [s since 1970]."""

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
 from typing import Protocol
 
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.simulation.virtual_adc import BoardParts
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from tests.end_to_end.lfp_pack import LfpPack
@@ -53,7 +53,7 @@ class PythonBoard:
         try:
             yield
         finally:
-            await end(task)
+            await end_tasks(task)
 
     @contextlib.asynccontextmanager
     async def accelerated(self, speed: float) -> AsyncIterator[None]:
@@ -63,7 +63,7 @@ class PythonBoard:
         try:
             yield
         finally:
-            await end(task)
+            await end_tasks(task)
 
     async def _run_slices(self, speed: float) -> None:
         loop = asyncio.get_running_loop()
@@ -104,4 +104,4 @@ async def open_board(kind: str, pack: LfpPack) -> AsyncIterator[Board]:
         try:
             yield SimulatedFirmware(firmware)
         finally:
-            await end(task)
+            await end_tasks(task)

@@ -7,7 +7,8 @@ import numpy as np
 
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, r_s
-from bms_estimator.model.cell import ELEMENTS, CellModel, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import ELEMENTS
 from bms_estimator.simulation.virtual_adc import Reading
 
 SERIES = 4

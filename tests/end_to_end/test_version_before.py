@@ -15,10 +15,10 @@ from bms_estimator.estimator.identified_parameters import relative_capacity, rel
 from bms_estimator.kernels.kalman_filter.records import LN_Q
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack, new_pack
-from bms_estimator.process.host import BootTimestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.outputs import Command, HomeAssistantSettings
+from bms_estimator.settings.connections import Command, HomeAssistantSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery, discovery_topic
 from tests.patience import LONG_S

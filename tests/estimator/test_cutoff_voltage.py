@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from bms_estimator.estimator.settings_plausibility import load_cutoff_v
+from bms_estimator.estimator.settings_plausibility import forecast_end_v
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import Settings
@@ -27,7 +27,7 @@ def test_the_first_known_voltage_is_the_cut_off(
     pack: dict[str, Any], alarms: dict[str, Any], expected_v: float
 ) -> None:
     settings = Settings.model_validate({"pack": pack, "alarms": alarms})
-    assert load_cutoff_v(settings, PACK) == pytest.approx(expected_v)
+    assert forecast_end_v(settings, PACK) == pytest.approx(expected_v)
 
 
 @pytest.mark.parametrize(
@@ -35,4 +35,4 @@ def test_the_first_known_voltage_is_the_cut_off(
 )
 def test_a_cut_off_at_the_voltage_of_the_full_pack_is_rejected(pack: dict[str, float], full: str) -> None:
     with pytest.raises(UserError, match=f"pack.cutoff_v = .*: must be below {full} V"):
-        load_cutoff_v(Settings.model_validate({"pack": pack}), PACK)
+        forecast_end_v(Settings.model_validate({"pack": pack}), PACK)

@@ -9,7 +9,8 @@ from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.hypotheses import spawn_after_gap, spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.records import LN_Q, LN_R, NODE, Noise
 from bms_estimator.model.arrays import Floats, SampleBlock
-from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.settings.observer import Sampling
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, Capture, Case, capture

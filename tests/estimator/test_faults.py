@@ -9,7 +9,8 @@ import pytest
 
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.sources.captures.replay import load_capture
 from tests.estimator.simulated_cell import TRUTH, pulses

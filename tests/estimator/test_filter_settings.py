@@ -16,7 +16,8 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     RESISTANCES,
     arrhenius,
 )
-from bms_estimator.model.cell import Ladder, TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import Ladder, TableOcv
 from bms_estimator.settings.observer import IdentifierSettings
 
 CELL = load_cell("ncr18650")

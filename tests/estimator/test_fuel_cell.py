@@ -12,9 +12,9 @@ from bms_estimator.kernels.cell_model.fuel_cell import NAMES
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.model.pack_model import load_fuel_cell
 from bms_estimator.pack.pack import Pack
-from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.fuel_cell_parameters import fuel_cell_parameters
 from bms_estimator.telemetry.parameters import make_parameters_payload
+from bms_estimator.telemetry.state import remaining_capacity_ah
 from tests import mann_stack
 from tests.estimator.simulated_cell import run_divided
 

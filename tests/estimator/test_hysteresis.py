@@ -10,7 +10,8 @@ from bms_estimator.kernels.cell_model.open_loop import hysteresis
 from bms_estimator.kernels.cell_model.rc_ladder import HYSTERESIS_ACTIVATION_ENERGY, arrhenius
 from bms_estimator.kernels.kalman_filter.records import HYST
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
-from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.settings.observer import IdentifierSettings
 
 SOC = (0.0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.65, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0)

@@ -9,10 +9,9 @@ from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import simulate_cell
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
-from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import ChargeEnergy, Window
-from bms_estimator.telemetry.state import make_state_payload, no_forecast
+from bms_estimator.telemetry.state import make_state_payload, no_forecast, remaining_capacity_ah
 from tests.estimator.random_steps import (
     FIRST_SOC,
     HALF_SECONDS_PER_HOUR,

@@ -11,7 +11,7 @@ from bms_estimator.calibration.thesis.series_resistance import (
     series_resistance,
     series_resistance_from_sums,
 )
-from bms_estimator.checkpoint.arrays_file import without_observer
+from bms_estimator.checkpoint.identity import without_observer
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.restore import restore_state
 from bms_estimator.kernels.observer.series_resistance import BINS, MAX_SAMPLES

@@ -15,7 +15,7 @@ from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.page.fleet_page import fleet_page
 from bms_estimator.fleet.page.nats_feed import Server
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from tests.fleet.hour_rows import BEGIN, FIRST_STD, estimate_capacities, write_fleet
 from tests.fleet.nats_cluster import running
 from tests.fleet.published_states import Pack, load, make_packs, publish, publish_heartbeat

@@ -13,7 +13,7 @@ from bms_estimator.edge.block import Block, decode
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.model.arrays import SampleBlock
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from tests.fleet.nats_cluster import connected
 from tests.patience import LONG_S
 
@@ -54,7 +54,7 @@ class Receiver:
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await end(self._task)
+        await end_tasks(self._task)
         await self.nc.close()
 
     @property

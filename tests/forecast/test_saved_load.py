@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bms_estimator.forecast.load_history import LoadHistory, PastMinutes, load_arrays, restore_load
 from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S

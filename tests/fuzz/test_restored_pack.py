@@ -7,21 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
 from bms_estimator.checkpoint.arrays_file import HISTORY_SUFFIX, LOAD_SUFFIX
 from bms_estimator.checkpoint.state_files import CheckpointFile, StateFiles
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
-from bms_estimator.kernels.cells.records import BANK_STATE
-from bms_estimator.kernels.cells.records import CELL as CELL_STATE
+from bms_estimator.kernels.cells.records import BANK_STATE, CELL as CELL_STATE
 from bms_estimator.kernels.records import ESTIMATOR_STATE
 from bms_estimator.model.arrays import SAMPLE, fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import new_pack
-from bms_estimator.pack_model import fit as fit_module
-from bms_estimator.pack_model import slow_fit as slow_fit_module
-from bms_estimator.pack_model import solve
+from bms_estimator.pack_model import fit as fit_module, slow_fit as slow_fit_module, solve
 from bms_estimator.pack_model.history import ReferenceDischarges, WeakCellTime
 from bms_estimator.pack_model.saved import curve_arrays, neutral_fit
 from bms_estimator.pack_model.slow_fit import Submit, run_now

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
 from bms_estimator.checkpoint.run_file import add_checksum
 from bms_estimator.checkpoint.state_files import StateFiles

@@ -14,7 +14,7 @@ import pytest
 
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.connection import Message
-from bms_estimator.settings.outputs import HomeAssistantSettings
+from bms_estimator.settings.connections import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.telemetry.state import UNKNOWN_SOC

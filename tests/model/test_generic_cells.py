@@ -10,7 +10,8 @@ from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.settings_plausibility import implausible_settings
 from bms_estimator.estimator.stability_conditions import failed_conditions
 from bms_estimator.kernels.step import SampleOutcome
-from bms_estimator.model.cell import TableOcv, generic_cells, load_cell, shipped_cells
+from bms_estimator.model.cell import generic_cells, load_cell, shipped_cells
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.settings.sensor import SensorSettings

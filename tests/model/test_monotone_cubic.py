@@ -1,8 +1,7 @@
 """Monotone cubic interpolation: bit for bit the results of scipy."""
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.model.monotone_cubic import MonotoneCubic

@@ -12,7 +12,7 @@ import structlog
 
 from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.mqtt.connection import DeliveryStats, check, tls_context
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox

@@ -11,7 +11,7 @@ import pytest
 
 from bms_estimator.mqtt.connection import ConnectOptions, brokers
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.patience import until
 from tests.sinks.sink_helpers import STATE_TOPIC, Sink, assert_all_in_order, numbered_state

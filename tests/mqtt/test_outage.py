@@ -10,7 +10,7 @@ import structlog
 
 from bms_estimator.mqtt.client import Timeouts
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy, read_packet
 from tests.patience import LONG_S, until

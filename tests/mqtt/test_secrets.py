@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.mqtt.connection import check
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from tests.command_line import run
 
 SECRET = "s3cret"

@@ -10,7 +10,7 @@ import pytest
 import structlog
 
 from bms_estimator.mqtt.topic_cache import MAX_BYTES, DeviceMessage, Subscriber
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from tests.mosquitto import Broker, Listener
 from tests.mqtt.proxy import Proxy
 from tests.patience import LONG_S, until

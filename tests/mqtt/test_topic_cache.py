@@ -3,8 +3,7 @@
 import json
 import string
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.mqtt.topic_cache import (
     MAX_DEVICE_BYTES,

@@ -12,8 +12,7 @@ from bms_estimator.pack.state import CHECKPOINT, HISTORY
 from bms_estimator.pack_model import slow_fit as slow_fit_module
 from bms_estimator.pack_model.cell_curves import SOC_GRID
 from bms_estimator.settings.pack import Settings
-from bms_estimator.simulation.simulated_pack import SimulatedPack as SimulatedLoad
-from bms_estimator.simulation.simulated_pack import constant
+from bms_estimator.simulation.simulated_pack import SimulatedPack as SimulatedLoad, constant
 from tests.pack_model.quick_fit import quick_fit
 from tests.simulated_pack import CAPACITY_AH, SimulatedPack
 

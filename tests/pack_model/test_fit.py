@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
-from hypothesis import strategies as st
+from hypothesis import Phase, given, settings, strategies as st
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from bms_estimator.estimator.estimator import Estimator

@@ -9,7 +9,8 @@ import pytest
 from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.estimator.identified_parameters import identified_cell, relative_series_resistance
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.pack_model.handover import adopt_curves
 from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.saved import curve_arrays, fit_from_arrays, history_arrays, history_from_arrays

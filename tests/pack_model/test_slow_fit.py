@@ -14,8 +14,7 @@ from bms_estimator.model.arrays import SampleBlock, SampleStatus
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.pack.pack import Pack
-from bms_estimator.pack_model import fit as fit_module
-from bms_estimator.pack_model import slow_fit as slow_fit_module
+from bms_estimator.pack_model import fit as fit_module, slow_fit as slow_fit_module
 from bms_estimator.pack_model.fit import FitError, PackFit
 from bms_estimator.pack_model.slow_fit import SlowFit, run_now
 from bms_estimator.settings.observer import Sampling

@@ -24,7 +24,7 @@ from bms_estimator.model.clock import Clock
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.page.page_sink import Pages, PageSink
 from bms_estimator.service.publisher import Publisher
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.setup.page.setup_server import SetupServer
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank

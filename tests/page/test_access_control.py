@@ -4,7 +4,7 @@ import pytest
 
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.page.access_control import AccessControl, make_access_control
-from bms_estimator.settings.outputs import PageSettings, parse_listen
+from bms_estimator.settings.connections import PageSettings, parse_listen
 
 TOKEN = "0123456789abcdef"
 

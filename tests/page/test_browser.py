@@ -20,7 +20,7 @@ from playwright.async_api import Browser
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.mqtt.topic_cache import MAX_DEVICES
 from bms_estimator.page.broker_page import dashboard
-from bms_estimator.settings.outputs import MqttSettings, PageSettings
+from bms_estimator.settings.connections import MqttSettings, PageSettings
 from bms_estimator.telemetry.state import forecast_fields, no_forecast
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener

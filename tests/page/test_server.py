@@ -19,7 +19,7 @@ from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import FILES, STATIC, PageServer
 from bms_estimator.page.page_sink import Pages, PageSink
 from bms_estimator.process import listener
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.store.history import epoch_s
 from tests.patience import LONG_S
 from tests.sinks.snapshots import CELL_SNAPSHOT

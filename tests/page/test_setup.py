@@ -8,7 +8,7 @@ import pytest
 from aiohttp import ClientSession
 from playwright.async_api import Page, expect
 
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.setup.page.setup_server import SetupServer
 from bms_estimator.simulation.simulated_pack import SimulatedBms
@@ -44,10 +44,19 @@ async def search_and_choose(page: Page, path: str) -> None:
     await expect(page.get_by_text("52.80 V, 35.00 A, discharging")).to_be_visible()
 
 
-@pytest.mark.parametrize("size", [PHONE, pytest.param(DESKTOP, marks=pytest.mark.thorough)], ids=["phone", "desktop"])
-async def test_page_leads_from_the_search_to_the_first_estimate(tmp_path: Path, size: dict[str, int]) -> None:
+@pytest.mark.parametrize(
+    ("size", "device_soc_std", "first_estimate"),
+    [
+        (PHONE, "none", r"State of charge\s+not known yet\s+Charge the pack to full once"),
+        pytest.param(DESKTOP, "10", r"State of charge\s+\d+\.\d\s*%\s+± \d", marks=pytest.mark.thorough),
+    ],
+    ids=["phone", "desktop"],
+)
+async def test_page_leads_from_the_search_to_the_first_estimate(
+    tmp_path: Path, size: dict[str, int], device_soc_std: str, first_estimate: str
+) -> None:
     file = tmp_path / "house.toml"
-    bms = SimulatedBms("jk", lambda _: Reading(35.0, 52.8, 21.0), cells=16)
+    bms = SimulatedBms("jk", lambda _: Reading(35.0, 52.8, 21.0), cells=16, soc=lambda: 0.62, capacity_ah=280.0)
     with running_device(bms) as path:
         async with (
             SetupServer(loopback(), file) as server,
@@ -56,17 +65,18 @@ async def test_page_leads_from_the_search_to_the_first_estimate(tmp_path: Path, 
         ):
             await search_and_choose(opened.page, path)
             await compare_voltage(opened.page)
-            await answer_questions(opened.page)
+            await answer_questions(opened.page, device_soc_std)
             await expect(opened.page.locator("[data-q=voltage]")).to_have_text("53.33")
-            await expect(opened.page.locator("[data-q=soc]")).to_have_text(re.compile(r"^\d+\.\d$"))
+            await expect(opened.page.locator(".card").first).to_have_text(
+                re.compile(first_estimate), use_inner_text=True
+            )
             await expect(opened.page.get_by_text("A first estimate under load is inexact")).to_be_visible()
             await expect(opened.page.get_by_text(f"bms-estimator run {file}")).to_be_visible()
             overflow = await opened.page.evaluate("document.documentElement.scrollWidth - innerWidth")
     assert overflow <= 0, "a part of the page is outside the screen"
     assert opened.errors == []
-    settings = load_settings(file)
-    assert (settings.pack.name, settings.pack.cell, settings.pack.series) == ("house", "lfp", 16)
-    assert settings.sensor.voltage_gain == pytest.approx(1.01)
+    pack, sensor = load_settings(file).pack, load_settings(file).sensor
+    assert (pack.name, pack.cell, pack.series, sensor.voltage_gain) == ("house", "lfp", 16, pytest.approx(1.01))
 
 
 async def compare_voltage(page: Page) -> None:
@@ -81,7 +91,7 @@ async def compare_voltage(page: Page) -> None:
     await expect(page.get_by_text("current: the sign is right")).to_be_visible()
 
 
-async def answer_questions(page: Page) -> None:
+async def answer_questions(page: Page, device_soc_std: str = "10") -> None:
     """Enter a capacity in mAh and an invalid port, which are rejected with the reasons, and then the right ones."""
     await page.get_by_role("button", name="Continue").click()
     await page.get_by_label("Chemistry").select_option("lfp")
@@ -90,6 +100,7 @@ async def answer_questions(page: Page) -> None:
     await page.get_by_role("button", name="Write").click()
     await expect(page.get_by_role("alert")).to_contain_text(["is it in mAh?", "Port out of range"])
     await page.get_by_label("Capacity of one cell").fill("280 Ah")
+    await page.get_by_label("How far may the SOC").fill(device_soc_std)
     await page.get_by_label("MQTT broker").fill("none")
     await page.get_by_role("button", name="Write").click()
 

@@ -16,7 +16,7 @@ from bms_estimator.page.pack_topics import PackTopics
 from bms_estimator.page.page_server import PageServer
 from bms_estimator.process import listener as listener_module
 from bms_estimator.process.listener import CONNECTIONS, Connections, Listener
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from tests.idle_connections import DESCRIPTORS, few_descriptors, hold_idle_connections
 from tests.patience import LONG_S, until
 

@@ -3,7 +3,7 @@
 import asyncio
 from contextlib import suppress
 
-from bms_estimator.process.runtime import FIRST_DELAY_S, MAX_DELAY_S, Backoff, end, until_first_ends
+from bms_estimator.process.runtime import FIRST_DELAY_S, MAX_DELAY_S, Backoff, end_tasks, until_first_ends
 
 
 def test_delays_double_up_to_the_maximum_and_differ_between_clients() -> None:
@@ -27,6 +27,6 @@ async def test_task_that_swallows_its_first_cancellation_ends_before_the_task_th
 
     running = asyncio.create_task(until_first_ends(swallow()))
     await started.wait()
-    await end(running)
+    await end_tasks(running)
     assert running.cancelled()
     assert asyncio.all_tasks() == {asyncio.current_task()}

@@ -5,8 +5,9 @@ import re
 import numpy as np
 import pytest
 
+from bms_estimator.reports.aging_group import AgingHistory
 from bms_estimator.reports.history_report import StoredHistory, history_report
-from bms_estimator.reports.report_parts import AgingHistory, duration_text
+from bms_estimator.reports.report_parts import duration_text
 from bms_estimator.store.history import Minute
 
 text_only = pytest.mark.usefixtures("empty_plots")

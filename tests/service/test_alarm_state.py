@@ -40,8 +40,7 @@ from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
 from tests.checkpoint.test_checkpoint import CELL, SETTINGS, edit_settings
 from tests.checkpoint.test_identity import CHECKPOINT_FILE
-from tests.patience import LONG_S
-from tests.patience import until as wait_until
+from tests.patience import LONG_S, until as wait_until
 from tests.scripted_source import Collector, ScriptedSource
 from tests.service.test_alarm_hooks import acknowledge_in
 

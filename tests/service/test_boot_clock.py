@@ -10,7 +10,7 @@ import pytest
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.cell import load_cell
-from bms_estimator.process.host import BootTimestamp, boot_timestamp, is_clock_synchronized
+from bms_estimator.process.boot_timestamp import BootTimestamp, boot_timestamp, is_clock_synchronized
 from bms_estimator.settings.pack import Settings
 
 CELL, SETTINGS = load_cell("chen_mora"), Settings()

@@ -16,7 +16,7 @@ from bms_estimator.checkpoint.run_file import RunCounters, RunFile
 from bms_estimator.checkpoint.state_files import FORMAT, MAX_LATER_FILES, CheckpointFile, StateFiles
 from bms_estimator.estimator.estimator import compiled_estimator
 from bms_estimator.model.payloads.health import Totals
-from bms_estimator.process.host import BootTimestamp
+from bms_estimator.process.boot_timestamp import BootTimestamp
 from bms_estimator.service import checkpoint_writer
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings

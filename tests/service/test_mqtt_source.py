@@ -11,7 +11,7 @@ import aiomqtt
 from structlog.testing import capture_logs
 
 from bms_estimator.model.cell import load_cell
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.alarms import AlarmSettings
 from bms_estimator.settings.pack import Settings
@@ -61,7 +61,7 @@ async def publishing(broker: Broker, voltage: str, current: str) -> AsyncIterato
     try:
         yield
     finally:
-        await end(task)
+        await end_tasks(task)
 
 
 @contextlib.asynccontextmanager
@@ -161,7 +161,7 @@ async def check_polling(broker: Broker, pack_settings: Settings, answers: Corout
             keepalive = await listener.wait("R/c0619ab/keepalive")
             assert keepalive == b'{"keepalive-options":["suppress-republish"]}'
         finally:
-            await end(device)
+            await end_tasks(device)
 
 
 async def test_the_next_broker_is_tried_and_the_unreachable_one_is_named(broker: Broker) -> None:
@@ -206,4 +206,4 @@ async def test_a_second_publisher_raises_sensor_fault(broker: Broker) -> None:
             await listener.wait_json("bms/pack/alarm/sensor_fault", lambda alarm: alarm["active"])
             await listener.wait_json(HEALTH_TOPIC, lambda h: h["line"]["publisher_errors"] > 0)
         finally:
-            await end(publishers)
+            await end_tasks(publishers)

@@ -22,8 +22,7 @@ from bms_estimator.model.payloads.health import PackModelHealth
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.pack.pack import Pack, new_pack
-from bms_estimator.pack_model import fit as fit_module
-from bms_estimator.pack_model import slow_fit as slow_fit_module
+from bms_estimator.pack_model import fit as fit_module, slow_fit as slow_fit_module
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.service.live_loop import ServiceParts, run_estimation_loop
 from bms_estimator.settings.pack import Settings

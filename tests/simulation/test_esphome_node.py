@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.virtual_adc import Reading

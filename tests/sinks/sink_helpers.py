@@ -8,7 +8,7 @@ from typing import Any, Self
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.mqtt.queue_sender import WINDOW
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.sinks.mqtt.requests import COMMANDS, RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink
 from bms_estimator.store.outbox import Outbox

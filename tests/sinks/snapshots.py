@@ -12,11 +12,16 @@ from bms_estimator.model.payloads.health import LoopHealth
 from bms_estimator.model.payloads.snapshot import Alarm, CellReport, CellsReport, Snapshot
 from bms_estimator.mqtt.connection import DeliveryStats
 from bms_estimator.settings.pack import Settings
-from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.health import make_health_payload
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import ChargeEnergy, Window, new_totals
-from bms_estimator.telemetry.state import make_forecast_payload, make_info_payload, make_state_payload, no_forecast
+from bms_estimator.telemetry.state import (
+    make_forecast_payload,
+    make_info_payload,
+    make_state_payload,
+    no_forecast,
+    remaining_capacity_ah,
+)
 
 NOW = 1_700_000_000.0
 """Wall clock of the snapshots [s since 1970]."""

@@ -12,8 +12,7 @@ import pytest
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.store import database as database_module
-from bms_estimator.store import history as history_module
+from bms_estimator.store import database as database_module, history as history_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.history import HistorySink, Minute
 from bms_estimator.store.history_reader import HistoryReader, PastEvent

@@ -1,7 +1,6 @@
 """``NumberRanges`` against a set of numbers."""
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.store.outbox_queue import NumberRanges
 

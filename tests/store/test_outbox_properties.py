@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import settings
-from hypothesis import strategies as st
+from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from bms_estimator.mqtt.connection import Message
-from bms_estimator.store import outbox as outbox_module
-from bms_estimator.store import outbox_queue as queue_module
+from bms_estimator.store import outbox as outbox_module, outbox_queue as queue_module
 from bms_estimator.store.database import Database, StoreError
 from bms_estimator.store.outbox import Outbox
 

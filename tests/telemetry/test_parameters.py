@@ -6,7 +6,8 @@ import pytest
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import SOC_GRID, ladder_of_branches
 from bms_estimator.model.arrays import SampleBlock
-from bms_estimator.model.cell import CellModel, Ladder, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import Ladder
 from bms_estimator.model.payloads.snapshot import Parameter
 from bms_estimator.settings.observer import IdentifierSettings
 from bms_estimator.telemetry.parameters import make_parameters_payload

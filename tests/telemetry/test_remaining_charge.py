@@ -11,9 +11,9 @@ from bms_estimator.kernels.cell_model import chen_mora
 from bms_estimator.model.arrays import SAMPLE, fields
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.observer import IdentifierSettings
-from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.health import identifier_counters, suspicions
 from bms_estimator.telemetry.parameters import make_parameters_payload
+from bms_estimator.telemetry.state import remaining_capacity_ah
 from tests.estimator.anywhere.cases import Case, capture
 
 CELL = load_cell("chen_mora").model_copy(update={"adaptation": {}})

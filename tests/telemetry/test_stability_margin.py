@@ -12,10 +12,16 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.settings.observer import IdentifierSettings, ObserverSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.alarms.evaluator import AlarmEvaluator
-from bms_estimator.telemetry.cells import remaining_capacity_ah
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import ChargeEnergy, Window
-from bms_estimator.telemetry.state import ALWAYS_STABLE, NOT_IDENTIFIED, UNKNOWN_SOC, make_state_payload, no_forecast
+from bms_estimator.telemetry.state import (
+    ALWAYS_STABLE,
+    NOT_IDENTIFIED,
+    UNKNOWN_SOC,
+    make_state_payload,
+    no_forecast,
+    remaining_capacity_ah,
+)
 from tests.estimator.simulated_cell import TRUTH, pulses, wrong_cell
 from tests.telemetry.alarm_captures import WALL_S, settings
 from tests.telemetry.test_parameters import CAPACITANCE_NAMES, file_with_ladder

@@ -19,7 +19,7 @@ from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 from bms_estimator.model import clock
-from bms_estimator.process import host
+from bms_estimator.process.boot_timestamp import BootTimestamp, boot_timestamp
 from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.telemetry import health
 from tests.world.disk import Disk
@@ -56,8 +56,8 @@ class Clocks:
     def monotonic(self) -> float:
         return self.since_boot() - self.suspended_s
 
-    def boot_timestamp(self) -> host.BootTimestamp:
-        return host.BootTimestamp(self.wall(), self.synchronized, self.since_boot(), self.boot)
+    def boot_timestamp(self) -> BootTimestamp:
+        return BootTimestamp(self.wall(), self.synchronized, self.since_boot(), self.boot)
 
 
 class _PatchedModule:
@@ -97,7 +97,7 @@ def replace_in_package(
         id(time.monotonic): clocks.monotonic,
         id(time.perf_counter): clocks.monotonic,
         id(clock.since_boot): clocks.since_boot,
-        id(host.boot_timestamp): clocks.boot_timestamp,
+        id(boot_timestamp): clocks.boot_timestamp,
         id(random.uniform): dice.uniform,
         id(random.random): dice.random,
         id(ThreadPoolExecutor): lambda *args, **named: threads().executor(*args, **named),

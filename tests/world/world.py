@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import structlog
 
@@ -20,11 +20,12 @@ from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.pack.state import REFUSED, PackState
 from bms_estimator.service import pack_service as service
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.observer import IdentifierSettings
-from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import PackSettings, PublishSettings, Settings, StateSettings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts
+from bms_estimator.sinks.sink import Sink
 from bms_estimator.sources import factory
 from bms_estimator.sources.serial.board_check import MAX_PENDING_READS, BoardCheck
 from bms_estimator.sources.serial.port_list import KnownBoardFile
@@ -110,17 +111,11 @@ class Result:
     """Statistics of the world by name."""
 
 
-class Probe:
+class Probe(Sink):
     """Sink that passes each snapshot of the service to the world."""
 
     def __init__(self, take: Callable[[Snapshot], None]) -> None:
-        self.publish = take
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        pass
+        self.publish = take  # type: ignore[method-assign]
 
 
 @dataclass

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bms_estimator.calibration.automatic.recognition import CapacityEstimate, RecognizedCapture
-from bms_estimator.calibration.cleaning.capture_checks import StartOrigin
-from bms_estimator.calibration.cleaning.capture_checks import initial_soc as soc_of_first_rest
+from bms_estimator.calibration.cleaning.capture_checks import StartOrigin, initial_soc as soc_of_first_rest
 from bms_estimator.calibration.cleaning.clean_capture import clean_capture
 from bms_estimator.calibration.elements.identify import Identification, identify
 from bms_estimator.calibration.elements.ladder_fit import MIN_SPAN_K

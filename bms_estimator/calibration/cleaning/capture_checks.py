@@ -11,7 +11,8 @@ from bms_estimator.calibration.cleaning.clean_capture import REST_C_RATE, SOC_SL
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv, r_s, soc_from_ocv
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, TableOcv, generic_cells, load_cell
+from bms_estimator.model.cell import CellModel, generic_cells, load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.charge_count import MIN_GAP_PERIODS, smaller_current_a
 
 FULL_SOC = 0.97

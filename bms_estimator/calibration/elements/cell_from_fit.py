@@ -30,7 +30,8 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.rc_ladder import HIGH_ACTIVATION_ENERGY, RESISTANCES, weak_share
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import LN_TAUS, SHORT_PAIRS
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import Capacitance, CellModel, Ladder, Resistance, TableOcv
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import Capacitance, Ladder, Resistance, TableOcv
 
 GENERIC_STD = 0.3
 """Minimum relative std of a generic ladder. A ladder with a smaller std was identified, so that its temperature range

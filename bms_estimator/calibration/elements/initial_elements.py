@@ -20,7 +20,8 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     arrhenius,
 )
 from bms_estimator.model.arrays import Floats, SampleBlock
-from bms_estimator.model.cell import Capacitance, CellModel, Ladder, Resistance, TableOcv, generic_cells, load_cell
+from bms_estimator.model.cell import CellModel, generic_cells, load_cell
+from bms_estimator.model.cell_sections import Capacitance, Ladder, Resistance, TableOcv
 from bms_estimator.model.errors import UserError
 
 SHORT_TAUS = np.geomspace(0.003, 0.05, 12)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.ocv.relaxation_test import MIN_POINTS, RelaxationTest
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import ChenMoraOcv
+from bms_estimator.model.cell_sections import ChenMoraOcv
 from bms_estimator.model.errors import UserError
 
 RELAXED_V = 0.002

@@ -17,7 +17,8 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
 )
 from bms_estimator.kernels.kalman_filter.records import Noise
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, Ladder, TableOcv
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import Ladder, TableOcv
 
 KELVIN = 273.15
 """Temperature of 0 C [K]."""

@@ -24,7 +24,7 @@ from bms_estimator.calibration.ocv.slow_curve import GRID, SlowCurve, slow_curve
 from bms_estimator.calibration.ocv.source import ExternalCurve, OcvSources, Recording, Source
 from bms_estimator.calibration.ocv.table_fit import NODES, TableFit, fit_table
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.model.cell import Ladder
+from bms_estimator.model.cell_sections import Ladder
 from bms_estimator.model.errors import UserError
 
 GIVEN_V = 1e-3

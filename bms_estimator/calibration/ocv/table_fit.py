@@ -23,7 +23,7 @@ from bms_estimator.calibration.ocv.chen_mora_fit import Points, check_points, rm
 from bms_estimator.calibration.ocv.overpotential import linear_interpolation_matrix
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import TableOcv
+from bms_estimator.model.cell_sections import TableOcv
 
 KNOTS: Floats = np.unique(
     np.r_[np.arange(0.0, 0.06, 0.015), np.arange(0.06, 0.25, 0.03), np.arange(0.25, 0.96, 0.045), 0.97, 0.985, 0.993, 1]

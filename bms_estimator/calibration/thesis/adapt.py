@@ -30,7 +30,8 @@ from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.filter_settings import BRANCHES_STD, ROOM_C, SOC_GRID, ladder_of_branches
 from bms_estimator.kernels.cell_model.rc_ladder import weak_share
 from bms_estimator.model.arrays import Floats, SampleBlock
-from bms_estimator.model.cell import Bounds, CellModel, Ladder, Resistance, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import Bounds, Ladder, Resistance
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.observer import ObserverSettings

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from bms_estimator.calibration.thesis.prediction import Prediction, open_circuit
 from bms_estimator.kernels.observer.series_resistance import BINS, MIN_CURRENT_C
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, Resistance
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import Resistance
 from bms_estimator.model.errors import UserError
 
 LOWEST_SOC = 0.1

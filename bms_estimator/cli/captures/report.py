@@ -39,9 +39,10 @@ from bms_estimator.pack_model.aging_course import aging_course
 from bms_estimator.pack_model.cell_curves import CellCurves
 from bms_estimator.pack_model.saved import history_from_arrays
 from bms_estimator.process.state_folder import state_folder
+from bms_estimator.reports.aging_group import AgingHistory
 from bms_estimator.reports.capture_report import capture_report
 from bms_estimator.reports.history_report import StoredHistory, history_report
-from bms_estimator.reports.report_parts import AgingHistory, ReportPage, number
+from bms_estimator.reports.report_parts import ReportPage, number
 from bms_estimator.settings.pack import Settings, load_settings
 from bms_estimator.sources.captures.replay import Capture, open_capture
 from bms_estimator.sources.captures.tables.layout import ColumnMap

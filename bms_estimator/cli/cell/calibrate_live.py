@@ -23,7 +23,7 @@ from bms_estimator.forecast.available_power import power_limits
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.runtime import configure_logs, end, stop_on_signal, until_first_ends
+from bms_estimator.process.runtime import configure_logs, end_tasks, stop_on_signal, until_first_ends
 from bms_estimator.settings.alarm_limits import monitored_alarms
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.captures.raw_capture import make_header
@@ -258,7 +258,7 @@ class _LiveTest:
                     if self._switch:
                         await self._switch.release()
                 finally:
-                    await end(reading)
+                    await end_tasks(reading)
 
     def _make_switch(self, source: SerialSource | LineSource) -> LoadSwitch | None:
         """Return the switch of the load; None without a relay.

@@ -30,7 +30,8 @@ from bms_estimator.estimator.identified_parameters import (
     ocv_correction_with_std,
     relative_capacity,
 )
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell, with_name
+from bms_estimator.model.cell import CellModel, load_cell, with_name
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.config_file import write_text
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import state_folder

@@ -16,7 +16,7 @@ from rich.table import Table
 from bms_estimator.calibration.fuel_cell_fit import KEYS, FuelCellFit, Source, fit_fuel_cell
 from bms_estimator.cli.options.capture_input import load_captures
 from bms_estimator.cli.options.capture_options import name_of, unique_names
-from bms_estimator.kernels.kalman_filter.temperature import MAX_PLAUSIBLE_C, MIN_PLAUSIBLE_C
+from bms_estimator.kernels.start import MAX_PLAUSIBLE_C, MIN_PLAUSIBLE_C
 from bms_estimator.model.arrays import CurrentSign, Floats, Masks
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import FuelCellModel, load_fuel_cell, write_cell

@@ -11,7 +11,7 @@ from bms_estimator.cli.options.pack_options import Browser, TokenFile, page_sett
 from bms_estimator.fleet.page import nats_feed
 from bms_estimator.fleet.page.fleet_page import fleet_page
 from bms_estimator.process.runtime import configure_logs, flush_logs
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 
 DEFAULT_LISTEN = "127.0.0.1:8080"
 """Default address of the page, host:port."""

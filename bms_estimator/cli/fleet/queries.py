@@ -39,12 +39,13 @@ def collect(
 
 
 async def _collect(address: ServerAddress, folder: Path, period_s: float) -> None:
-    from bms_estimator.fleet.nats.connection import run_connected  # noqa: PLC0415
+    from bms_estimator.fleet.nats.connection import connect, run_connected  # noqa: PLC0415
     from bms_estimator.fleet.queries.collector import Collector  # noqa: PLC0415
     from bms_estimator.process.runtime import stop_on_signal  # noqa: PLC0415
 
-    stop = stop_on_signal()
-    await run_connected(lambda nc: Collector(nc, folder, period_s=period_s).run(stop), stop, "collector", address)
+    stop, (server, creds, ca) = stop_on_signal(), address
+    connection = connect(server, "collector", creds=creds, ca=ca)
+    await run_connected(lambda nc: Collector(nc, folder, period_s=period_s).run(stop), stop, connection)
 
 
 def repair(

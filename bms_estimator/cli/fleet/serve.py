@@ -19,8 +19,8 @@ from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.model.config_file import error_reason, read_toml
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import configure_logs, flush_logs
+from bms_estimator.settings.connections import parse_listen
 from bms_estimator.settings.fleet import FleetSettings
-from bms_estimator.settings.outputs import parse_listen
 from bms_estimator.settings.pack import DeviceName
 
 SettingsFile = Annotated[

@@ -17,7 +17,7 @@ from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFle
 from bms_estimator.model.config_file import without_secrets, write_text
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import stop_on_signal
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 
 PAST_BLOCKS = 30 * 24 * 60
 """Number of blocks before the present at which packs faster than real time begin by default: 30 days."""

@@ -10,7 +10,7 @@ from bms_estimator.cli.options.pack_options import Browser, TokenFile, page_sett
 from bms_estimator.page.broker_page import dashboard as broker_page
 from bms_estimator.process.runtime import configure_logs, flush_logs
 from bms_estimator.process.state_folder import state_folder
-from bms_estimator.settings.outputs import DEFAULT_LISTEN, MqttSettings, PageSettings
+from bms_estimator.settings.connections import DEFAULT_LISTEN, MqttSettings, PageSettings
 from bms_estimator.settings.pack import Settings, load_settings
 
 

@@ -91,7 +91,7 @@ async def _notify_alive(
         status = (
             f"no samples: {source.silence_reason}"
             if source.silence_reason
-            else f"{sender.store.waiting} blocks not sent"
+            else f"{sender.queue.waiting} blocks not sent"
         )
         if status != sent_status:
             notifier.status(name, status)

@@ -14,7 +14,7 @@ from bms_estimator.model.config_file import suggestion, without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import load_fuel_cell
 from bms_estimator.process.runtime import configure_logs, stop_on_signal, until_first_ends
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.simulation.bms_responses import BMS_RESPONSES
 from bms_estimator.simulation.esphome_node import SimulatedNode

@@ -21,8 +21,8 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import PackModel, load_model
 from bms_estimator.process.runtime import stop_on_signal
 from bms_estimator.protocols.base.polled_protocol import BMS_GAIN_STD
+from bms_estimator.settings.connections import MqttSettings, PageSettings
 from bms_estimator.settings.observer import BOARD_GAIN_STD
-from bms_estimator.settings.outputs import MqttSettings, PageSettings
 from bms_estimator.settings.pack import PackSettings, Settings, load_settings
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.serial.port_list import named_ports

@@ -8,7 +8,7 @@ from pydantic.json_schema import models_json_schema
 
 from bms_estimator.model.payloads.health import PAYLOAD_VERSION
 from bms_estimator.mqtt.connection import MAX_BYTES
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.pack import DEVICE_NAME, MAX_RATE_HZ, MIN_RATE_HZ
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY
 from bms_estimator.sinks.mqtt.requests import COMMANDS, MAX_PAYLOAD_BYTES, READS

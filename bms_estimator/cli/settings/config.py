@@ -7,7 +7,7 @@ import tomlkit
 import typer
 
 from bms_estimator.cli.options.pack_options import load_pack
-from bms_estimator.estimator.settings_plausibility import load_cutoff_v
+from bms_estimator.estimator.settings_plausibility import forecast_end_v
 from bms_estimator.estimator.settings_records import estimator_settings
 from bms_estimator.kernels.cell_model.chen_mora import delta
 from bms_estimator.model.cell import CellModel, load_cell
@@ -63,7 +63,7 @@ def _derived_of_battery(settings: Settings, cell: CellModel) -> dict[str, float]
     a = {i: cell.bounds(i).limit for i in range(7, 13)}
     return {
         "pack.capacity_ah": cell.cell.capacity_ah,
-        "pack.cutoff_v": load_cutoff_v(settings, cell),
+        "pack.cutoff_v": forecast_end_v(settings, cell),
         # SOC below which C_ts is negative, (2.11) of the thesis
         "observer.delta_1": delta(exponent=a[8], offset=a[9], amplitude=a[7]),
         # SOC below which C_tl is negative, (2.12) of the thesis

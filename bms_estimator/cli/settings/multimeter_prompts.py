@@ -1,9 +1,10 @@
 """Comparison with a multimeter on the command line: from options, or by prompts."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import typer
 
@@ -92,13 +93,13 @@ def _compare_interactively(comparison: Comparison) -> None:
         )
 
 
-def _set_zero(comparison: Comparison, text: str) -> Awaitable[str]:
+def _set_zero(comparison: Comparison, text: str) -> Coroutine[Any, Any, str]:
     if text != "0":
         raise InvalidAnswerError(f"{text}: must be 0; press Enter without a value to skip this step")
     return comparison.set_zero()
 
 
-def _ask_and_compare(text: str, compare: Callable[[str], Awaitable[str]]) -> bool:
+def _ask_and_compare(text: str, compare: Callable[[str], Coroutine[Any, Any, str]]) -> bool:
     """Ask for a value until the comparison accepts it. Return False if the step is skipped."""
     while answer := str(typer.prompt(text, default="", show_default=False)).strip():
         try:
@@ -110,10 +111,7 @@ def _ask_and_compare(text: str, compare: Callable[[str], Awaitable[str]]) -> boo
     return False
 
 
-def _run(compare: Callable[[], Awaitable[str]]) -> None:
-    async def run() -> str:
-        return await compare()
-
+def _run(compare: Callable[[], Coroutine[Any, Any, str]]) -> None:
     with show_status("measuring"):
-        result = asyncio.run(run())
+        result = asyncio.run(compare())
     typer.echo(f"  {result}")

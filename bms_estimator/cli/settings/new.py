@@ -33,6 +33,8 @@ from bms_estimator.setup.new_pack import create_pack, run_command
 from bms_estimator.setup.questions import QUESTIONS, Question
 from bms_estimator.setup.search import SearchResult, default_places, search
 
+PLACES = "serial port, mqtt://host, Modbus host, bluetooth"
+"""Kinds of places to search."""
 ESTIMATE_S = 5.0
 """Time over which the first estimates are shown [s]."""
 
@@ -43,7 +45,7 @@ def new(
         list[str] | None,
         typer.Option(
             "--search",
-            help="where to search: path of a serial port, URL of an MQTT broker (mqtt://user:pw@host), host name of a Modbus device, or bluetooth; may be repeated; default: all USB serial ports, the MQTT broker on this machine, Bluetooth",
+            help="where to search: path of a serial port, URL of an MQTT broker (mqtt://user:pw@host), host name of a Modbus device, or bluetooth; may be repeated; default: asked on a terminal, otherwise all USB serial ports, the MQTT broker on this machine, Bluetooth",
             show_default=False,
         ),
     ] = None,
@@ -117,7 +119,7 @@ def new(
     configure_logs(deque[str](maxlen=1))  # the wizard reports faults itself
     with _reported_interruption(file):
         prompts = Prompts(yes=yes)
-        result = _search(search_at or ([device] if device and device.startswith("/") else _default_places()))
+        result = _search(search_at or ([device] if device and device.startswith("/") else _places(prompts)))
         result = _log_in(prompts, result)
         answers = _choose_device(prompts, result, device)
         measured = _measure(answers.device)
@@ -162,12 +164,18 @@ def _reported_interruption(file: Path) -> Iterator[None]:
         raise typer.Exit(130) from None
 
 
-def _default_places() -> list[str]:
-    """Return the places that are searched by default. If none is a serial port, print this."""
-    places = default_places()
-    if not any(place.startswith("/") for place in places):
+def _places(prompts: Prompts) -> list[str]:
+    """Return the places to search. On a terminal they are asked for first, because a search takes up to 20 s."""
+    places = " ".join(default_places())
+    if "/dev/" not in places:
         typer.echo("-  no USB serial port is connected; --search PATH searches another serial port")
-    return places
+    return prompts.ask(
+        f"Where to search ({PLACES})",
+        "--search",
+        None if prompts.is_interactive else places,
+        str.split,
+        default=places,
+    )
 
 
 def _search(places: Sequence[str], earlier: Sequence[FoundDevice] = ()) -> SearchResult:
@@ -191,7 +199,7 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
     """
     if not result.devices and device is None and not prompts.is_interactive:
         raise UserError("--search: no device was found; give its place: --search PLACE")
-    text = "Number of the device, or another place to search (serial port, mqtt://host, Modbus host)"
+    text = f"Number of the device, or another place to search ({PLACES})"
     may_search = prompts.is_interactive and device is None
     while True:
         parse = partial(_parse_device, result=result, may_search=may_search)

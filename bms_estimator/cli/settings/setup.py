@@ -11,7 +11,7 @@ import typer
 
 from bms_estimator.cli.options.pack_options import Browser, TokenFile, open_browser, page_settings, whole
 from bms_estimator.process.runtime import configure_logs, stop_on_signal
-from bms_estimator.settings.outputs import DEFAULT_LISTEN, PageSettings
+from bms_estimator.settings.connections import DEFAULT_LISTEN, PageSettings
 from bms_estimator.settings.pack import require_new
 from bms_estimator.setup.page.setup_server import SetupServer
 

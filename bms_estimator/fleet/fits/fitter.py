@@ -27,7 +27,7 @@ from pydantic import ValidationError
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.fits.messages import FitRequest
 from bms_estimator.fleet.fits.pack_history import FitAnswer, FitJob, run_job
-from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text, run_connected
+from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, connect, error_text, run_connected
 from bms_estimator.fleet.nats.stream_reader import read_stream
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.packs.pack_type import type_estimator
@@ -58,7 +58,7 @@ class Options:
     """Options of the process.
 
     Attributes:
-        servers, creds, ca: Arguments of ``run_connected``.
+        servers, creds, ca: Arguments of ``connect``.
         processes: Number of fits that run in parallel.
     """
 
@@ -78,7 +78,7 @@ async def fit_packs(options: Options, stop: asyncio.Event) -> None:
     async def run(nc: Client) -> None:
         await until_first_ends(Fitter(nc, options).run(), stop.wait())
 
-    await run_connected(run, stop, NAME, (options.servers, options.creds, options.ca))
+    await run_connected(run, stop, connect(options.servers, NAME, creds=options.creds, ca=options.ca))
 
 
 class Fitter:

@@ -17,14 +17,14 @@ from pydantic import ValidationError
 from bms_estimator.edge import subjects
 from bms_estimator.edge.batching import Batcher
 from bms_estimator.edge.block import BlockError, decode
+from bms_estimator.edge.block_queue import RETRY_S, BlockQueue
 from bms_estimator.edge.block_sender import MAX_BLOCK_AGE
-from bms_estimator.edge.block_store import RETRY_S, BlockStore
 from bms_estimator.edge.block_table import INGEST_TABLES, NS_PER_S, PackPosition, Progress
 from bms_estimator.edge.subjects import BlockRequest
 from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection, select_new
 from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.worker.block_order import CONFIRM_EVERY, last_sample_s
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.store.database import Database
 
 MAX_PACK_BLOCKS = 10_080
@@ -73,7 +73,7 @@ class IngestStore:
     def __init__(self, nc: Client, folder: Path, partitions: int, block_s: float) -> None:
         self._nc, self._partitions, self._block_s, self.published = nc, partitions, block_s, 0
         self._database = Database(folder / FILE, tables=INGEST_TABLES, sync_s=0.0, retry_s=RETRY_S)
-        self.blocks = BlockStore(self._database, subjects.raw, max_blocks=MAX_PACK_BLOCKS)
+        self.blocks = BlockQueue(self._database, subjects.raw, max_blocks=MAX_PACK_BLOCKS)
         self._open: dict[str, _OpenBlock] = {}
         self._task: asyncio.Task[None] | None = None
 
@@ -89,7 +89,7 @@ class IngestStore:
     ) -> None:
         """Close the database."""
         if self._task is not None:
-            await end(self._task)
+            await end_tasks(self._task)
         await self._database.__aexit__()
 
     def last_s(self, pack: str) -> float:

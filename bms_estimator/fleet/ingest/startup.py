@@ -7,27 +7,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import nats.errors
-import structlog
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.folder_lock import lock_folder
 from bms_estimator.fleet.ingest.ingest_store import IngestStore
-from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, close, connect, error_text
-from bms_estimator.fleet.nats.streams import make_telemetry_stream, partitions_of
+from bms_estimator.fleet.nats.connection import close, connect, retry_until_ready
+from bms_estimator.fleet.nats.streams import make_telemetry_stream, require_partitions
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.model.arrays import CurrentSign
-from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.runtime import end, until_first_ends
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.runtime import result_before
 from bms_estimator.sources.captures.tables.layout import ColumnMap
 
 NAME = "ingest"
 """Name of the process, for systemd and the server."""
 PRESENCE_TIMEOUT_S = 1.0
 """Timeout of the request to another process [s]. The server rejects the request at once if no process runs."""
-
-log = structlog.get_logger(__name__)
 
 
 @dataclass(frozen=True)
@@ -62,13 +59,11 @@ async def open_ingest(
         UserError: An option cannot be used, or another process uses the folder.
     """
     with lock_folder(options.folder, ".lock", "another `fleet ingest` uses it; end it", mode=0o700):
-        starting = asyncio.ensure_future(_start(options))
-        await until_first_ends(asyncio.wait([starting]), stop.wait())
-        if not starting.done():
-            await end(starting)
+        started = await result_before(stop, _start(options))
+        if started is None:
             yield None
             return
-        nc, partitions, bucket = starting.result()
+        nc, partitions, bucket = started
         try:
             async with IngestStore(nc, options.folder, partitions, options.block_s) as store:
                 yield nc, store, bucket
@@ -79,26 +74,15 @@ async def open_ingest(
 async def _start(options: Options) -> tuple[Client, int, PackBucket]:
     """Connect, and create the stream; repeat until the server has the streams, and no other process runs."""
     nc = await connect(options.servers, NAME, creds=options.creds, ca=options.ca)
-    last_reason, is_claimed = "", False
-    while True:
-        try:
-            if not is_claimed:
-                await _claim(nc)
-            is_claimed = True
-            await make_telemetry_stream(nc, options.buffer_bytes)
-            partitions = await partitions_of(nc)
-            bucket = PackBucket(nc)
-            await bucket.refresh()
-        except (*RETRYABLE_ERRORS, UserError) as error:
-            if nc.is_closed:
-                raise TemporaryError(f"the server {options.servers} has closed the connection: check --creds") from None
-            if (text := error_text(error)) != last_reason:
-                log.warning("waiting", reason=text)
-            last_reason = text
-            await asyncio.sleep(RETRY_S)
-            continue
-        if partitions is not None:
-            return nc, partitions, bucket
+
+    async def prepare() -> tuple[int, PackBucket]:
+        await make_telemetry_stream(nc, options.buffer_bytes)
+        partitions, bucket = await require_partitions(nc), PackBucket(nc)
+        await bucket.refresh()
+        return partitions, bucket
+
+    await retry_until_ready(nc, options.servers, lambda: _claim(nc), "waiting")
+    return (nc, *await retry_until_ready(nc, options.servers, prepare, "waiting"))
 
 
 async def _claim(nc: Client) -> None:

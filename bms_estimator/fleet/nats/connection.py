@@ -6,8 +6,9 @@ import logging
 import re
 import ssl
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
+from typing import Any, TypeVar
 
 import nats.aio.client
 import nats.errors
@@ -17,9 +18,11 @@ from nats.aio.client import Client
 from nats.aio.transport import TcpTransport
 
 from bms_estimator.fleet.nats.stream_reader import StreamError
-from bms_estimator.model.errors import UserError
-from bms_estimator.process.runtime import end, until_first_ends
+from bms_estimator.model.errors import TemporaryError, UserError
+from bms_estimator.process.runtime import result_before
 
+Result = TypeVar("Result")
+"""Result of ``retry_until_ready``."""
 _TEXT_BY_CLASS: dict[type[BaseException], str] = {
     nats.js.errors.NotFoundError: "a stream is missing on the server: create it with `bms-estimator fleet serve`",
     nats.js.errors.NoStreamResponseError: "no node leads the stream now, or the server keeps no streams for this account",
@@ -131,35 +134,61 @@ async def connect(
 async def run_connected(
     run: Callable[[Client], Awaitable[None]],
     stop: asyncio.Event,
-    name: str,
-    address: tuple[str, Path | None, Path | None],
+    connection: Coroutine[Any, Any, Client],
 ) -> None:
     """Connect, run a service, and close the connection. If ``stop`` is set before a server is found, nothing is run.
 
     Args:
         run: Runs the service until ``stop`` is set.
         stop: Event that ends the service.
-        name: Name of the connection.
-        address: Arguments ``servers``, ``creds`` and ``ca`` of ``connect``.
+        connection: Call of ``connect``.
 
     Raises:
         UserError: The address cannot be used.
     """
-    servers, creds, ca = address
-    connecting = asyncio.ensure_future(connect(servers, name, creds=creds, ca=ca))
-    try:
-        # a stop cancels only ``asyncio.wait``; therefore ``connecting`` is done only if there is a connection or an error
-        await until_first_ends(asyncio.wait([connecting]), stop.wait())
-    finally:
-        if not connecting.done():
-            await end(connecting)
-    if connecting.cancelled():
+    nc = await result_before(stop, connection)
+    if nc is None:
         return
-    nc = connecting.result()
     try:
         await run(nc)
     finally:
         await close(nc)
+
+
+async def retry_until_ready(
+    nc: Client, servers: str, attempt: Callable[[], Awaitable[Result]], event: str = "waiting for the server"
+) -> Result:
+    """Return the result of ``attempt``, which is repeated until the server has all that it needs.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+        servers: Address of the server, for the error.
+        attempt: Function that raises one of ``RETRYABLE_ERRORS`` or a ``UserError`` if it has to be repeated.
+        event: Event of the log lines, one for each new reason.
+
+    Raises:
+        TemporaryError: The server has closed the connection permanently.
+    """
+    last_reason = ""
+    while True:
+        try:
+            return await attempt()
+        except (*RETRYABLE_ERRORS, UserError) as error:
+            raise_if_closed(nc, servers)
+            if (text := error_text(error)) != last_reason:
+                log.warning(event, reason=text)
+            last_reason = text
+        await asyncio.sleep(RETRY_S)
+
+
+def raise_if_closed(nc: Client, servers: str) -> None:
+    """Raise an error if the connection is closed and will not be restored.
+
+    Raises:
+        TemporaryError: The server has closed the connection permanently.
+    """
+    if nc.is_closed:
+        raise TemporaryError(f"the server {servers} has closed the connection: check --creds")
 
 
 async def close(nc: Client) -> None:

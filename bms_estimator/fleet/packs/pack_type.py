@@ -9,10 +9,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.arrays_file import pack_identity
+from bms_estimator.checkpoint.identity import pack_identity
 from bms_estimator.estimator.cell_estimator import CellEstimator
 from bms_estimator.estimator.estimator import Estimator, make_estimator
-from bms_estimator.estimator.settings_plausibility import load_cutoff_v
+from bms_estimator.estimator.settings_plausibility import forecast_end_v
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.pack import Pack, assemble
@@ -186,7 +186,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], adv
         short_limit_a=short_limit_a(settings, cell),
         meter=ChargeEnergyMeter(ChargeEnergy(), float(estimator.settings["gap_s"][0]), record["flow"]["sums"]),
         capacity_ah=cell.capacity_ah,
-        cutoff_v=load_cutoff_v(settings, cell) if isinstance(cell, CellModel) else math.nan,
+        cutoff_v=forecast_end_v(settings, cell) if isinstance(cell, CellModel) else math.nan,
         filter_bytes=estimator.settings_record["filter"].view(np.uint8),
         cell_file_bytes=bytes_of(estimator.cell_file_settings),
     )

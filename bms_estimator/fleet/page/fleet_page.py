@@ -16,8 +16,8 @@ from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.page.page_server import STATIC as SHARED
 from bms_estimator.page.web_server import File, WebServer
-from bms_estimator.process.runtime import end
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.process.runtime import end_tasks
+from bms_estimator.settings.connections import PageSettings
 
 OVERVIEW_S = 2.0
 """Interval between two overviews of the fleet [s]."""
@@ -82,7 +82,7 @@ async def fleet_page(
         try:
             yield page.url
         finally:
-            await end(*tasks)
+            await end_tasks(*tasks)
 
 
 async def _send_overviews(view: FleetView, latest: LatestValues, overview_s: float) -> None:

@@ -21,7 +21,7 @@ from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.packs.pack_row import PackSpec
 from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 
 TABLE_S = 2.0
 """Poll interval for changes of the table of packs and of the dead letters, and retry interval [s]."""
@@ -81,7 +81,7 @@ class FleetFeed:
     async def __aexit__(self, *_: object) -> None:
         """Disconnect."""
         if self._task is not None:
-            await end(self._task)
+            await end_tasks(self._task)
         if self._nc is not None:
             await close(self._nc)
 

@@ -17,42 +17,37 @@ from pathlib import Path
 import structlog
 from nats.errors import Error as NatsError
 
-from bms_estimator.fleet.nats.streams import NoAnswerError
+from bms_estimator.fleet.nats.connection import close
+from bms_estimator.fleet.nats.streams import NoAnswerError, make_streams
+from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.credentials import write_file
-from bms_estimator.fleet.server.disk_space import available_bytes
-from bms_estimator.fleet.server.local_client import scheme
-from bms_estimator.fleet.server.metrics_endpoint import metrics_endpoint
-from bms_estimator.fleet.server.monitor import POLL_S, is_healthy, query_monitor, wait_for_monitor
+from bms_estimator.fleet.server.disk_space import available_bytes, sizes_of
+from bms_estimator.fleet.server.jwt_claims import Role
+from bms_estimator.fleet.server.local_client import connect, scheme
 from bms_estimator.fleet.server.nats_config import Node, configuration
-from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec, check_node_disk, check_tls_files, node_config
-from bms_estimator.fleet.server.node_watch import NodeWatch
-from bms_estimator.fleet.server.tenant_streams import make_all_streams
-from bms_estimator.model.errors import UserError
+from bms_estimator.fleet.server.node_spec import (
+    NodeLocation,
+    ServerSpec,
+    check_node_disk,
+    check_tls_files,
+    makes_streams,
+    node_config,
+)
+from bms_estimator.fleet.server.node_watch import (
+    POLL_S,
+    NodeWatch,
+    is_healthy,
+    metrics_endpoint,
+    query_monitor,
+    wait_for_monitor,
+)
+from bms_estimator.model.errors import TemporaryError, UserError
 from bms_estimator.process.child_process import find_server, terminate_with_parent
-from bms_estimator.process.runtime import end
-from bms_estimator.settings.fleet import FleetSettings
+from bms_estimator.process.runtime import end_tasks
+from bms_estimator.settings.fleet import FleetSettings, TenantSettings
 
 OTHER_FILES = 1000
 """Number of open files besides the connections of edges: files of the streams and connections of workers."""
-
-
-def warn_of_open_file_limit(settings: FleetSettings) -> None:
-    """Log a warning if the limit of open files is too small for a connection of each pack's edge.
-
-    The hard limit counts, because nats-server raises its soft limit to it.
-    """
-    packs = sum(tenant.packs or settings.server.packs for tenant in settings.tenants_or_default.values())
-    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    if limit != resource.RLIM_INFINITY and limit < packs + OTHER_FILES:
-        log.warning(
-            "the limit of open files is too small for all edges: increase LimitNOFILE of the systemd unit, or ulimit -n",
-            packs=packs,
-            limit=limit,
-        )
-
-
-log = structlog.get_logger(__name__)
-
 RELOAD_TIMEOUT_S = 60.0
 """Timeout of a reload of the server's settings [s]."""
 FORWARDED_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR2)
@@ -64,6 +59,8 @@ MIN_FREE_FRACTION = 0.05
 """Minimum free fraction of a disk that was full, for the restart of the server. The alert ``FleetDiskFull`` has the same limit."""
 CONFIGURATION = "nats-server.conf"
 """Name of the server's configuration file."""
+
+log = structlog.get_logger(__name__)
 
 
 async def serve(location: NodeLocation, read_spec: Callable[[], ServerSpec], report: Callable[[str], None]) -> int:
@@ -118,7 +115,7 @@ async def _serve_until_restart(
             code = await ended
             is_restart = needs_restart.done() and not end_requested.is_set()
         finally:
-            await end(streams_ready, supervising, needs_restart)
+            await end_tasks(streams_ready, supervising, needs_restart)
         if is_restart:
             return None
         return 0 if end_requested.is_set() else code
@@ -225,3 +222,62 @@ async def _make_ready(location: NodeLocation, spec: ServerSpec, pid: int, report
 
 def _has_reloaded(before: Mapping[str, object], varz: Mapping[str, object]) -> bool:
     return varz.get("config_load_time") not in (None, before.get("config_load_time"))
+
+
+async def make_all_streams(location: NodeLocation, spec: ServerSpec, report: Callable[[str], None]) -> None:
+    """Create the streams of all tenants, if ``makes_streams`` is true for this node."""
+    node = node_config(location, spec)
+    if not makes_streams(location, node):
+        report("ready; streams are made by the node that has the keys, the first")
+        return
+    for name, tenant in spec.settings.tenants_or_default.items():
+        await _make_streams(location, spec, name, tenant)
+        keys = f"; its keys: {location.keys / name}" if name else ""
+        report(f"{f'tenant {name}: ' if name else ''}streams ready, {node.partitions} partitions{keys}")
+
+
+async def _make_streams(location: NodeLocation, spec: ServerSpec, name: str, tenant: TenantSettings) -> None:
+    node, server, sizes = node_config(location, spec), spec.settings.server, sizes_of(spec.settings, tenant)
+    try:
+        nc = await connect(node, credentials.credentials_file(location.keys, name, Role.ADMIN) if name else None)
+    except TimeoutError:
+        raise NoAnswerError(f"{node.nats}: the server does not accept the connection in time") from None
+    except (NatsError, OSError) as error:
+        raise TemporaryError(f"{node.nats}: the server rejects the connection: {error}") from None
+    try:
+        await make_streams(
+            nc,
+            partitions=node.partitions,
+            replicas=location.replicas,
+            raw_bytes=sizes.raw,
+            raw_age_s=86_400.0 * (tenant.outage_days or server.outage_days),
+            states_bytes=sizes.states,
+            history_bytes=sizes.history,
+            max_pack_blocks=sizes.pack_blocks,
+        )
+    except NoAnswerError:
+        raise
+    except UserError as error:
+        hint = (
+            ": reduce packs or outage_days, or increase disk_gb, of this tenant or of the server"
+            if "insufficient" in str(error)
+            else ""
+        )
+        raise type(error)(f"{f'tenant {name}: ' if name else ''}{error}{hint}") from None
+    finally:
+        await close(nc)
+
+
+def warn_of_open_file_limit(settings: FleetSettings) -> None:
+    """Log a warning if the limit of open files is too small for a connection of each pack's edge.
+
+    The hard limit counts, because nats-server raises its soft limit to it.
+    """
+    packs = sum(tenant.packs or settings.server.packs for tenant in settings.tenants_or_default.values())
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    if limit != resource.RLIM_INFINITY and limit < packs + OTHER_FILES:
+        log.warning(
+            "the limit of open files is too small for all edges: increase LimitNOFILE of the systemd unit, or ulimit -n",
+            packs=packs,
+            limit=limit,
+        )

@@ -4,6 +4,7 @@ import ssl
 from dataclasses import dataclass
 from pathlib import Path
 
+from bms_estimator.fleet.server import credentials
 from bms_estimator.fleet.server.disk_space import GB, USABLE_FRACTION, check_disk_space
 from bms_estimator.fleet.server.nats_config import Accounts, Cluster, Node, Tls
 from bms_estimator.model.errors import UserError
@@ -130,3 +131,8 @@ def _listen_address(cluster_address: str) -> str:
     """
     listen = client_address(cluster_address)
     return cluster_address if listen.loopback else f"0.0.0.0:{listen.port}"
+
+
+def makes_streams(location: NodeLocation, node: Node) -> bool:
+    """Return True if this node creates the streams: the node with the keys; without accounts, the first node."""
+    return location.number == 1 if node.accounts is None else credentials.has_keys(location.keys)

@@ -20,7 +20,7 @@ from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
 from bms_estimator.mqtt.connection import brokers, tls_context
 from bms_estimator.process.runtime import until_first_ends
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 
 POLL_S = 0.1
 """Interval between two checks for due blocks [s]."""

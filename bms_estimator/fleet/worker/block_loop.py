@@ -152,7 +152,7 @@ class DeliveredMessages:
         self._wake_up.clear()
 
     @contextlib.contextmanager
-    def served(self) -> Iterator[None]:
+    def processed_by_loop(self) -> Iterator[None]:
         """Let the block loop process messages while the context lasts."""
         self._is_task_waiting = True
         if self._consumer.waiting:
@@ -164,5 +164,5 @@ class DeliveredMessages:
 
     async def wait(self) -> None:
         """Let the block loop process messages until the task of the partition is woken up."""
-        with self.served():
+        with self.processed_by_loop():
             await self._wake_up.wait()

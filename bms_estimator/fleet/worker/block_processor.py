@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bms_estimator.checkpoint.arrays_file import without_observer
+from bms_estimator.checkpoint.identity import without_observer
 from bms_estimator.edge.block import Block
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
 from bms_estimator.fleet.fits.messages import FitResult
@@ -35,10 +35,10 @@ from bms_estimator.model.arrays import NO_CELLS, CellBlock, SampleBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.health import Payload
 from bms_estimator.pack.state import CHECKPOINT, REFUSED
-from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload, remaining_capacity_ah
+from bms_estimator.telemetry.cells import estimate_fields, make_cells_payload
 from bms_estimator.telemetry.parameters import make_parameters_payload
 from bms_estimator.telemetry.publish_window import ChargeEnergy, Window
-from bms_estimator.telemetry.state import make_state_payload
+from bms_estimator.telemetry.state import make_state_payload, remaining_capacity_ah
 
 MAX_WALL_S = 2.0**34
 """Latest plausible wall clock [s since 1970]: the year 2514."""

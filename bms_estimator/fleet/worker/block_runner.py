@@ -17,7 +17,7 @@ from bms_estimator.edge.block import peek_header
 from bms_estimator.fleet.nats.dead_letters import DeadLetter
 from bms_estimator.fleet.worker.block_result import INTERNAL_ERROR, BlockResult, ResultPublisher
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.fleet.worker.pinned_consumer import RawMessage, is_block
+from bms_estimator.fleet.worker.partition_reader import RawMessage, is_block
 from bms_estimator.fleet.worker.takeover import ReplayGuard
 
 MAX_CPU_FRACTION = 0.1
@@ -27,7 +27,7 @@ BURST_S = 0.2
 MAX_CHARGE_S = 0.1
 """Maximum processor time that is charged for one block [s], the cost of 20,000 samples. The first block may take longer,
 because it compiles kernels."""
-MAX_PACKS = 10_000
+MAX_LEVELS = 10_000
 """Number of stored bucket levels above which levels of 0 are removed: those packs are idle."""
 
 
@@ -72,7 +72,7 @@ class CpuBudget:
     def charge(self, pack: str, cpu_s: float) -> None:
         """Count processor time that a pack has used [s]."""
         self._levels[pack] = self._level_s(pack) + min(cpu_s, MAX_CHARGE_S), self._clock()
-        if len(self._levels) > MAX_PACKS:
+        if len(self._levels) > MAX_LEVELS:
             self._levels = {name: level for name, level in self._levels.items() if self._level_s(name)}
 
     def _level_s(self, pack: str) -> float:

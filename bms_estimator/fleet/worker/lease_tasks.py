@@ -15,7 +15,7 @@ from bms_estimator.fleet.nats.connection import RETRYABLE_ERRORS, error_text
 from bms_estimator.fleet.nats.unsaved_blocks import unsaved_blocks
 from bms_estimator.fleet.packs.pack_registry import PackRegistry
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 
 log = structlog.get_logger(__name__)
 
@@ -77,7 +77,7 @@ class LeaseTasks:
                 task.result()
 
     async def _release(self, number: int) -> None:
-        await end(self._tasks[number])
+        await end_tasks(self._tasks[number])
         async with self._release_slots:
             if self._is_connected():
                 await self._leases[number].release()
@@ -95,13 +95,11 @@ class PeriodicStorage:
 
     Attributes:
         checkpoint_s: Duration of the last written checkpoint [s]; None before the first.
-        troubles: Errors of the last attempts to store something, by partition.
     """
 
     def __init__(self, nc: Client, interval_s: float, partitions: int) -> None:
         self._nc, self._interval_s, self._partitions = nc, interval_s, partitions
         self.checkpoint_s: float | None = None
-        self.troubles: dict[int, str] = {}
 
     def first_due_s(self, number: int, now_s: float) -> float:
         """Return the time of a partition's first checkpoint. The checkpoints of the partitions are spread over the interval."""
@@ -113,25 +111,27 @@ class PeriodicStorage:
             now_s = time.monotonic()
             if (lease.checkpoint_due_s <= now_s or lease.is_checkpoint_too_new) and self._nc.is_connected:
                 lease.checkpoint_due_s, previous = now_s + self._interval_s, lease.last_checkpoint
-                await self._try(lease, lease.save)
+                await self._try(lease, "checkpoint", lease.save)
                 if lease.last_checkpoint != previous:
                     self.checkpoint_s = time.monotonic() - now_s
 
     async def send_results(self, leases: Sequence[PartitionLease]) -> None:
         """Send the queued summaries and dead letters again."""
         for lease in leases:
-            if lease.results.waiting and self._nc.is_connected:
-                await self._try(lease, lease.results.send_queued)
+            # also without queued messages, because the save of a checkpoint may have sent those that failed here
+            if self._nc.is_connected:
+                await self._try(lease, "results", lease.results.send_queued)
 
-    async def _try(self, lease: PartitionLease, action: Callable[[], Awaitable[None]]) -> None:
+    async def _try(self, lease: PartitionLease, kind: str, action: Callable[[], Awaitable[None]]) -> None:
         """Run ``action``. After an error of connection or server, the next call that is due tries again."""
-        self.troubles.pop(lease.number, None)
         try:
             await action()
         except RETRYABLE_ERRORS as error:
             event, reason = "a checkpoint, summary or dead letter could not be stored; trying again", error_text(error)
             log.warning(event, partition=lease.number, reason=reason)
-            self.troubles[lease.number] = f"{event}: {reason}"
+            lease.storage_troubles[kind] = f"{event}: {reason}"
+        else:
+            lease.storage_troubles.pop(kind, None)
 
 
 class UnsavedCheck:

@@ -26,11 +26,11 @@ from bms_estimator.telemetry.alarms.definitions import (
     MODEL_SUSPECTS,
     QUANTITIES,
     SENSOR_SUSPECTS,
+    AlarmMessage as AlarmContent,
     EvaluationKernel,
     RaisedAlarm,
     alarm_payload,
 )
-from bms_estimator.telemetry.alarms.definitions import AlarmMessage as AlarmContent
 from bms_estimator.telemetry.cells import cell_alarm_inputs
 from bms_estimator.telemetry.health import identifier_counters, last_anchor, last_change, suspicions
 

@@ -30,7 +30,8 @@ from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointSto
 from bms_estimator.fleet.worker.checkpoint.claims import Claim, FencedError
 from bms_estimator.fleet.worker.deferred import Span
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer, RawMessages
+from bms_estimator.fleet.worker.partition_reader import PartitionReader
+from bms_estimator.fleet.worker.pinned_consumer import DeliveredMessage, PinnedConsumer
 from bms_estimator.fleet.worker.table_in_force import PackLookup, PackSources
 from bms_estimator.fleet.worker.takeover import ReplayGuard, restore_partition
 
@@ -66,6 +67,7 @@ class PartitionLease:
         claim: Claim of this worker; None while it has none.
         checkpoint_due_s: Monotonic clock at which the next checkpoint is due [s].
         trouble: Text of the present error; empty without one.
+        storage_troubles: Texts of the present errors of ``PeriodicStorage``, by kind of data.
         refused_format: Format of the last checkpoint if this worker cannot read it, and therefore refuses the partition;
             otherwise None.
     """
@@ -88,7 +90,7 @@ class PartitionLease:
         self.number, self._table, self._sources = number, table, sources
         self._checkpoints, self._checkpoint_format, self._block_loop = checkpoints, checkpoint_format, block_loop
         self.totals = totals
-        self._js, self._messages, self._is_busy = nc.jetstream(), RawMessages(nc, number), is_busy
+        self._js, self._messages, self._is_busy = nc.jetstream(), PartitionReader(nc, number), is_busy
         self._guard = ReplayGuard(checkpoints.replays, number)
         self.results = ResultPublisher(nc)
         self.runner = BlockRunner(
@@ -104,7 +106,7 @@ class PartitionLease:
         self.consumer = PinnedConsumer(nc, number, f"{inbox}.{number}")
         self.partition: Partition | None = None
         self.claim: Claim | None = None
-        self.trouble, self.checkpoint_due_s = "", 0.0
+        self.trouble, self.checkpoint_due_s, self.storage_troubles = "", 0.0, dict[str, str]()
         self.refused_format: int | None = None
         self._delivered = DeliveredMessages(
             self.consumer, self._guard, self.results, block_loop, self._process_next, self._try
@@ -162,10 +164,10 @@ class PartitionLease:
                 await self._try(self._read_undelivered)
             elif self._are_changes_due:
                 self._are_changes_due = False
-                with delivered.served():
+                with delivered.processed_by_loop():
                     await self._try(self._send_table_changes)
             elif (partition := self.partition) and (due := partition.deferred.next(self._is_due)):
-                with delivered.served():
+                with delivered.processed_by_loop():
                     if not await self._try(partial(self._process_deferred, partition, *due)):
                         await asyncio.sleep(RETRY_S)
             else:
@@ -229,10 +231,11 @@ class PartitionLease:
             )
 
     def drop(self) -> None:
-        """Drop state and claim, and add the events in the partition to the totals of the worker."""
+        """Drop state, claim and troubles, and add the events in the partition to the totals of the worker."""
         if self.partition:
             self.totals.events.update(self.partition.events)
         self.partition = self.claim = None
+        self.storage_troubles.clear()
 
     def on_settings_changed(self, pack: str) -> None:
         """Handle a changed or new row of the table of packs."""

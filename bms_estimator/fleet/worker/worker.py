@@ -1,11 +1,11 @@
 """Worker process, which processes its share of the partitions on one connection."""
 
 import asyncio
+import itertools
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import structlog
 from nats.aio.client import Client
@@ -15,54 +15,28 @@ from pydantic import ValidationError
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import DEAD_S, HEARTBEAT_S, Heartbeat
-from bms_estimator.fleet.nats.connection import RETRY_S, RETRYABLE_ERRORS, close, connect, error_text
+from bms_estimator.fleet.nats.connection import (
+    RETRYABLE_ERRORS,
+    close,
+    connect,
+    error_text,
+    raise_if_closed,
+    retry_until_ready,
+)
 from bms_estimator.fleet.nats.streams import require_partitions
 from bms_estimator.fleet.packs.pack_bucket import PackBucket
 from bms_estimator.fleet.worker.block_loop import BlockLoop
 from bms_estimator.fleet.worker.block_runner import Totals
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import UnreadableFormatError
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore, open_checkpoints
-from bms_estimator.fleet.worker.heartbeats import HeartbeatReport, Membership
+from bms_estimator.fleet.worker.heartbeat_report import HeartbeatReport
 from bms_estimator.fleet.worker.lease_tasks import LeaseTasks, PeriodicStorage, UnknownPacks, UnsavedCheck
+from bms_estimator.fleet.worker.membership import Membership
 from bms_estimator.fleet.worker.partition_lease import PartitionLease
 from bms_estimator.fleet.worker.pinned_consumer import RENEW_S
-from bms_estimator.model.errors import TemporaryError, UserError
-from bms_estimator.process.runtime import end, until_first_ends
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.runtime import end_tasks, result_before, until_first_ends
 from bms_estimator.process.systemd import SystemdNotifier
-
-
-class TenantStores(NamedTuple):
-    """Stores of a tenant."""
-
-    partitions: int
-    """Total number of partitions."""
-    checkpoints: CheckpointStore
-    bucket: PackBucket
-    """Table of packs."""
-
-
-async def open_stores(nc: Client, worker: str) -> TenantStores:
-    """Open the buckets and read the table of packs.
-
-    Args:
-        nc: Connection to the tenant's NATS account.
-        worker: Name of the worker.
-
-    Raises:
-        UserError: A stream is missing.
-    """
-    partitions = await require_partitions(nc)
-    try:
-        await nc.jetstream().stream_info(subjects.FITS_STREAM)
-    except NotFoundError:
-        raise UserError(
-            f"the server has no stream {subjects.FITS_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
-        ) from None
-    checkpoints = await open_checkpoints(nc, worker)
-    bucket = PackBucket(nc)
-    await bucket.refresh()
-    return TenantStores(partitions, checkpoints, bucket)
-
 
 CHECKPOINT_S = 300.0
 """Default interval between two checkpoints of a partition [s]."""
@@ -103,13 +77,9 @@ async def work(options: Options, stop: asyncio.Event) -> None:
         UserError: An option cannot be used, or the server has closed the connection permanently.
     """
     notifier = SystemdNotifier([options.name])
-    starting = asyncio.ensure_future(_start(options, notifier))
-    # a stop cancels only ``asyncio.wait``; therefore ``starting`` is done only if the worker was created
-    await until_first_ends(asyncio.wait([starting]), stop.wait())
-    if not starting.done():
-        await end(starting)
+    worker = await result_before(stop, _start(options, notifier))
+    if worker is None:
         return
-    worker = starting.result()
     try:
         await until_first_ends(worker.run(), stop.wait())
     finally:
@@ -120,26 +90,31 @@ async def work(options: Options, stop: asyncio.Event) -> None:
 async def _start(options: Options, notifier: SystemdNotifier) -> "Worker":
     """Connect and create a worker; repeat until the server has the streams."""
     nc = await connect(options.servers, options.name, creds=options.creds, ca=options.ca)
-    last_reason = ""
-    while True:
-        try:
-            return Worker(nc, options, await open_stores(nc, options.name), notifier)
-        except (*RETRYABLE_ERRORS, UserError) as error:
-            _raise_if_closed(nc, options)
-            if (text := error_text(error)) != last_reason:
-                log.warning("waiting for the server", reason=text)
-            last_reason = text
-        await asyncio.sleep(RETRY_S)
+    stores = await retry_until_ready(nc, options.servers, lambda: open_stores(nc, options.name))
+    return Worker(nc, options, stores, notifier)
 
 
-def _raise_if_closed(nc: Client, options: Options) -> None:
-    """Raise an error if the connection is closed and will not be restored.
+async def open_stores(nc: Client, worker: str) -> tuple[int, CheckpointStore, PackBucket]:
+    """Return the number of partitions, the store of the checkpoints, and the table of packs, after reading it.
+
+    Args:
+        nc: Connection to the tenant's NATS account.
+        worker: Name of the worker.
 
     Raises:
-        TemporaryError: The server has closed the connection permanently.
+        UserError: A stream is missing.
     """
-    if nc.is_closed:
-        raise TemporaryError(f"the server {options.servers} has closed the connection: check --creds")
+    partitions = await require_partitions(nc)
+    try:
+        await nc.jetstream().stream_info(subjects.FITS_STREAM)
+    except NotFoundError:
+        raise UserError(
+            f"the server has no stream {subjects.FITS_STREAM}: upgrade and restart `bms-estimator fleet serve` before the workers"
+        ) from None
+    checkpoints = await open_checkpoints(nc, worker)
+    bucket = PackBucket(nc)
+    await bucket.refresh()
+    return partitions, checkpoints, bucket
 
 
 class Worker:
@@ -148,11 +123,13 @@ class Worker:
     Args:
         nc: Connection to the tenant's NATS account.
         options: Options of the worker.
-        stores: Stores of the tenant.
+        stores: Result of ``open_stores``.
         notifier: Notifies systemd that the worker is ready, alive or stopping.
     """
 
-    def __init__(self, nc: Client, options: Options, stores: TenantStores, notifier: SystemdNotifier) -> None:
+    def __init__(
+        self, nc: Client, options: Options, stores: tuple[int, CheckpointStore, PackBucket], notifier: SystemdNotifier
+    ) -> None:
         self._nc, self._options, self._notifier = nc, options, notifier
         self._partitions, self._checkpoints, self._bucket = stores
         self._members = Membership(options.name)
@@ -205,7 +182,7 @@ class Worker:
         # a pin expires without requests: continue them until each consumer is released
         renewing = asyncio.ensure_future(_repeat(RENEW_S, self._send_requests))
         await self._lease_tasks.release_all()
-        await end(renewing)
+        await end_tasks(renewing)
         await close(self._nc)
 
     @property
@@ -250,7 +227,7 @@ class Worker:
 
     async def _update_leases(self) -> None:
         """Claim assigned partitions, release the others, and request more messages."""
-        _raise_if_closed(self._nc, self._options)
+        raise_if_closed(self._nc, self._options.servers)
         now_s = time.monotonic()
         # without a connection no heartbeat arrives, and while the event loop was blocked none was read
         if not self._nc.is_connected or now_s > self._leases_updated_s + DEAD_S / 2.0:
@@ -320,15 +297,15 @@ class Worker:
                     lease.on_settings_changed(pack)
 
     def _heartbeat(self) -> Heartbeat:
-        lease_trouble = next((lease.trouble for lease in self._leases if lease.trouble), "")
+        waiting = (lease.trouble for lease in self._leases if lease.trouble)
+        storage = (trouble for lease in self._leases for trouble in lease.storage_troubles.values())
         return self._report.make(
             self._leases,
             self._members.refused_partitions(),
             leaving=self._leaving,
             reconnects=self._nc.stats["reconnects"],
             checkpoint_s=self._storage.checkpoint_s,
-            trouble=lease_trouble
-            or next(iter(self._storage.troubles.values()), self._bucket.fault or self._unsaved.warning),
+            trouble=next(itertools.chain(waiting, storage), self._bucket.fault or self._unsaved.warning),
         )
 
 

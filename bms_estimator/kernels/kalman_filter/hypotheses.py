@@ -63,7 +63,6 @@ from bms_estimator.kernels.kalman_filter.records import (
 )
 from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.temperature import (
-    is_temperature,
     update_arrhenius_factors,
 )
 from bms_estimator.kernels.kalman_filter.window import prepare_transition, reset_window
@@ -121,7 +120,7 @@ def initialize_filter(s: Record, p: Record, soc: float, current_a: float, temper
     s.started, s.best = 1, 0
     s.current_a = current_a
     s.smallest_a = 0.0
-    s.sensed = 1 if is_temperature(temperature_c) else 0
+    s.sensed = 1 if math.isfinite(temperature_c) else 0
     s.temperature_c = temperature_c if s.sensed else REFERENCE_C
     update_arrhenius_factors(s)
     initialize_load_statistics(s, p, current_a)

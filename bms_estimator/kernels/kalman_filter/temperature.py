@@ -31,11 +31,6 @@ MAX_RATE_K_S = 0.1
 RATE_LIMIT_DELAY_S = 60.0
 """Delay until the rate limit of the temperature applies [s], because some sensors report 85 C at first."""
 
-MIN_PLAUSIBLE_C = -60.0
-"""Lowest plausible temperature of a cell [C]."""
-MAX_PLAUSIBLE_C = 120.0
-"""Highest plausible temperature of a cell [C]."""
-
 HEAT_J = 22.0
 """Heat capacity per Ah of a cell [J/(K Ah)]. Fits to an LG M50 at C/2 and 1C give 22 and 24 J/(K Ah)."""
 COOLING_S = 600.0
@@ -56,12 +51,6 @@ def propagate_self_heating(s: Record, p: Record) -> None:
     steady_c = REFERENCE_C + loss_w / p.series * COOLING_S / (HEAT_J * p.capacity_as / 3600.0)
     s.temperature_c = steady_c + (s.temperature_c - steady_c) * math.exp(-w.time_s / COOLING_S)
     s.temperature_c = min(s.temperature_c, MAX_MODELLED_C)
-
-
-@njit(cache=True)
-def is_temperature(temperature_c: float) -> bool:
-    """Return True for a plausible temperature, False for NaN. Sensors with an open wire report -127 or -300 C."""
-    return MIN_PLAUSIBLE_C <= temperature_c <= MAX_PLAUSIBLE_C
 
 
 @njit(cache=True)

@@ -27,7 +27,6 @@ from bms_estimator.kernels.kalman_filter.temperature import (
     MAX_RATE_K_S,
     RATE_LIMIT_DELAY_S,
     TEMPERATURE_S,
-    is_temperature,
     propagate_self_heating,
 )
 from bms_estimator.model.arrays import Record
@@ -62,7 +61,7 @@ def integrate_current(s: Record, p: Record, dt_s: float, gap: bool, current_a: f
         current_a: Current of this sample [A].
         temperature_c: Temperature of the cell [C]; NaN without a sensor.
     """
-    if is_temperature(temperature_c):
+    if math.isfinite(temperature_c):
         share = min(1.0, dt_s / TEMPERATURE_S) if s.sensed else 1.0
         max_change_k = MAX_RATE_K_S * dt_s if s.sensed and s.seeded_s > RATE_LIMIT_DELAY_S else math.inf
         s.temperature_c += min(max(share * (temperature_c - s.temperature_c), -max_change_k), max_change_k)

@@ -6,7 +6,7 @@ Numbers in parentheses are sections and equations of the thesis, and E1 to E37 a
 import numpy as np
 
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import Bounds
+from bms_estimator.model.cell_sections import Bounds
 
 CHEN_MORA_ROUNDED = (0.30, 29.0, 0.04, 6.0, 155.0, 0.04, 752.0, 13.0, 703.0, 6050.0, 27.0, 4475.0, 0.1, 24.0, 0.07)
 """Rounded a1..a15 of Chen and Mora, which are also the initial values of Tables 2 and 3."""

@@ -29,7 +29,8 @@ from bms_estimator.calibration.thesis.series_resistance import (
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts, simulate_cell
 from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock
-from bms_estimator.model.cell import Bounds, CellModel, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import Bounds
 from bms_estimator.reports.thesis import printed_values
 from bms_estimator.settings.observer import ObserverSettings
 

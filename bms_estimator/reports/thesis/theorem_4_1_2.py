@@ -20,7 +20,8 @@ from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, cell_step, r_s, r_tl, r_ts, terminal_voltage
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import Bounds, CellModel
+from bms_estimator.model.cell import CellModel
+from bms_estimator.model.cell_sections import Bounds
 from bms_estimator.reports.thesis.simulation import (
     IDEAL_RESOLUTION_V,
     discharge,

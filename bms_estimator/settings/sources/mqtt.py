@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from bms_estimator.model.config_file import Positive, Strict
 from bms_estimator.protocols.registry import DEVICES
-from bms_estimator.settings.outputs import BrokerSettings, BrokerUrls
+from bms_estimator.settings.connections import BrokerSettings, BrokerUrls
 from bms_estimator.settings.sources.mqtt_profiles import PROFILES, ProfileName
 from bms_estimator.settings.sources.source import BaseSource, Name, as_tuple
 

@@ -132,7 +132,7 @@ class SetupSession:
         self.answers = replace(self.answers, sensor=await self._comparison.finish())
         self.step = Step.PACK
 
-    def create(self, texts: Mapping[str, str]) -> None:
+    async def create(self, texts: Mapping[str, str]) -> None:
         """Write the settings file from the texts of all answers, and start the estimator.
 
         An empty text is replaced by the default. If an answer is invalid, its reason is stored and nothing is written.

@@ -15,7 +15,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.page.page_server import FILES as PAGE_FILES
 from bms_estimator.page.web_server import File, WebServer
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.setup.answers import InvalidAnswerError
 from bms_estimator.setup.broker_login import BrokerLogin
 from bms_estimator.setup.page.session import SetupSession
@@ -53,13 +53,13 @@ class SetupServer(WebServer):
         steps: dict[str, Callable[[Fields], Awaitable[None]]] = {
             "/search": self._search,
             "/login": self._log_in,
-            "/device": self._choose_device,
+            "/device": lambda fields: self._session.choose_device(fields.get("device", "")),
             "/compare/voltage": functools.partial(self._compare, "voltage"),
             "/compare/zero": functools.partial(self._compare, "zero"),
             "/compare/current": functools.partial(self._compare, "current"),
             "/compare/direction": functools.partial(self._compare, "direction"),
             "/continue": lambda _: self._session.finish_comparison(),
-            "/pack": self._create,
+            "/pack": self._session.create,
         }
         super().__init__(
             settings,
@@ -79,6 +79,7 @@ class SetupServer(WebServer):
     def _show(self, estimate: Estimate) -> None:
         """Send an estimate to the page."""
         values = {
+            "unknown": estimate.soc is not None and not estimate.soc_known,
             "soc": None if estimate.soc is None else 100.0 * estimate.soc,
             "band": None if estimate.soc_std is None else 200.0 * estimate.soc_std,  # two standard deviations [%]
             "voltage": estimate.voltage_v,
@@ -121,11 +122,5 @@ class SetupServer(WebServer):
         login = BrokerLogin(*(fields.get(name, "") for name in ("url", "username", "password")))
         self._session.start_search([login.address])
 
-    async def _choose_device(self, fields: Fields) -> None:
-        await self._session.choose_device(fields.get("device", ""))
-
     async def _compare(self, quantity: str, fields: Fields) -> None:
         await self._session.compare(quantity, fields.get("value", "").strip())
-
-    async def _create(self, fields: Fields) -> None:
-        self._session.create(fields)

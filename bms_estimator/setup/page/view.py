@@ -12,6 +12,7 @@ from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
 from bms_estimator.setup.new_pack import run_command
 from bms_estimator.setup.page.session import SetupSession, Step
 from bms_estimator.setup.questions import QUESTIONS, Question
+from bms_estimator.telemetry.state import UNKNOWN_SOC
 
 TITLES = {
     Step.SEARCH: "Search",
@@ -66,9 +67,8 @@ def _search(session: SetupSession, form_key: str) -> str:
         '<p class="note">One place per line: path of a serial port, URL of an MQTT broker (mqtt://user:password@host), host name of a '
         "Modbus device, or bluetooth. A serial port takes up to 20 s.</p>"
     )
-    found = session.step is Step.DEVICE and bool(session.result.devices)
     button = "Search again" if session.step is Step.DEVICE or session.error else "Search"
-    return f'<section class="card">{_form("search", form_key, content, button, secondary=found)}</section>'
+    return f'<section class="card">{_form("search", form_key, content, button, secondary=bool(session.result.devices))}</section>'
 
 
 def _searching(session: SetupSession, _: str) -> str:
@@ -124,8 +124,8 @@ def _multimeter(session: SetupSession, form_key: str) -> str:
 
 
 def _pack(session: SetupSession, form_key: str) -> str:
-    asked = [each for each in QUESTIONS if session.answers and each.is_asked(session.answers)]
-    fields = "".join(_question(session, question) for question in asked)
+    answers = session.answers
+    fields = "".join(_question(session, each) for each in QUESTIONS if answers and each.is_asked(answers))
     return f'<section class="card">{_form("pack", form_key, fields, "Write the settings file")}</section>'
 
 
@@ -134,15 +134,15 @@ def _done(session: SetupSession, _: str) -> str:
         return ""
     warnings = f"<ul class='bad'>{_items(session.pack.warnings)}</ul>" if session.pack.warnings else ""
     install, run = escape(shlex.join(root_command("install", session.file))), escape(run_command(session.file))
-    current_a = session.measured.current_a if session.measured else 0.0
-    note = load_note(current_a, session.pack.cell.cell.capacity_ah)
-    note = f'<p class="note">{note}</p>' if note else ""
+    capacity_ah = session.pack.cell.cell.capacity_ah
+    note = load_note(session.measured.current_a, capacity_ah) if session.measured else ""
     return (
-        '<section class="card"><h2>State of charge</h2><p class="huge"><b data-q="soc">&nbsp;</b><small>%</small></p>'
-        '<p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p>'
+        '<section class="card"><h2>State of charge</h2><div id="known"><p class="huge"><b data-q="soc">&nbsp;</b>'
+        '<small>%</small></p><p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p></div>'
+        f'<div id="unknown" hidden><p class="unknown">not known yet</p><p>{UNKNOWN_SOC.partition(": ")[2].capitalize()}.</p></div>'
         '<p id="wait" role="status">Waiting for the first estimate. The first start compiles the kernels, which takes a '
         'minute or two.</p><p>measured <b data-q="voltage"></b> V, <b data-q="current"></b> A</p>'
-        f"{note}</section>"
+        f'<p class="note">{note}</p></section>'
         f'<section class="card"><h2>{escape(str(session.file))} is written</h2><p>{escape(session.pack.summary)}</p>'
         f"{warnings}<p>End this program, then run the estimator here:</p><pre>{run}</pre>"
         f"<p>or install the service:</p><pre>{install}</pre></section>"
@@ -173,8 +173,7 @@ def _question(session: SetupSession, question: Question) -> str:
         )
         control = f'<select name="{question.name}" required><option value=""></option>{options}</select>'
     else:
-        hint = "" if default else question.hint
-        control = f'<input name="{question.name}" value="{escape(entered)}" placeholder="{hint}" autocomplete="off">'
+        control = f'<input name="{question.name}" value="{escape(entered)}" placeholder="{"" if default else question.hint}" autocomplete="off">'
     return f"<label>{escape(question.text)}{explanation}{control}{error}</label>"
 
 

@@ -27,7 +27,7 @@ from bms_estimator.model.payloads.snapshot import Alarm, Snapshot
 from bms_estimator.process.runtime import FIRST_DELAY_S, Backoff, finish
 from bms_estimator.process.stderr_writer import DaemonThreadExecutor
 from bms_estimator.process.systemd import credential_path
-from bms_estimator.settings.outputs import InfluxSettings
+from bms_estimator.settings.connections import InfluxSettings
 
 STATE = "bms_state"
 """Name of the measurement of states. The tag ``device`` is the pack."""

@@ -18,7 +18,7 @@ from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.quantity import quantity
 from bms_estimator.process.listener import CONNECTIONS, Listener
-from bms_estimator.settings.outputs import PrometheusSettings
+from bms_estimator.settings.connections import PrometheusSettings
 
 SHUTDOWN_TIMEOUT_S = 1.0
 """Shutdown timeout of open connections [s]."""
@@ -193,7 +193,7 @@ class PrometheusSink:
 
     def __init__(self, settings: PrometheusSettings) -> None:
         self._last: Snapshot | None = None
-        self._server = MetricsServer(settings.host, settings.port, self._collect)
+        self._server = MetricsServer(*settings.address, self._collect)
 
     def publish(self, snapshot: Snapshot) -> None:
         """Store a snapshot for the next scrape, with the last estimate if it has none."""

@@ -15,7 +15,7 @@ from bms_estimator.model.payloads.snapshot import Info
 from bms_estimator.model.quantity import Entity, field_entities, raw_entity
 from bms_estimator.settings.alarm_kinds import ALARM_KINDS
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.outputs import Command, HomeAssistantSettings
+from bms_estimator.settings.connections import Command, HomeAssistantSettings
 from bms_estimator.settings.pack import MAX_RATE_HZ, MIN_RATE_HZ
 
 ESTIMATE = field_entities(Estimate, "all")

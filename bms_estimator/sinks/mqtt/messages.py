@@ -17,7 +17,7 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.model.quantity import Entity
 from bms_estimator.mqtt.connection import Message
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.outputs import HomeAssistantSettings
+from bms_estimator.settings.connections import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import (
     VALUES,
     DiscoveryInputs,

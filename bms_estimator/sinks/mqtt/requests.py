@@ -16,7 +16,7 @@ import structlog
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.connection import DeliveryStats
-from bms_estimator.settings.outputs import Command
+from bms_estimator.settings.connections import Command
 
 COMMANDS = get_args(Command)
 """Names of all commands."""

@@ -31,7 +31,7 @@ from bms_estimator.mqtt.queue_sender import DeniedTopics, QueueSender
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import FIRST_DELAY_S, finish
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.outputs import HomeAssistantSettings, MqttSettings
+from bms_estimator.settings.connections import HomeAssistantSettings, MqttSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY, SENSOR_AVAILABILITY, MessageBuilder, PublishedState
 from bms_estimator.sinks.mqtt.requests import MAX_SHOWN, RequestDispatcher
 from bms_estimator.store.outbox import Outbox

@@ -23,7 +23,7 @@ from bms_estimator.mqtt.connection import (
 )
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector
 from bms_estimator.protocols.base.reading import CONNECTED
-from bms_estimator.settings.outputs import BrokerSettings
+from bms_estimator.settings.connections import BrokerSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.sources.mqtt import MqttSource
 from bms_estimator.sources.mqtt.sample_assembler import SampleAssembler

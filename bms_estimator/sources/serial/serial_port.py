@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING
 import structlog
 
 from bms_estimator.model.clock import since_boot
-from bms_estimator.process.runtime import FIRST_RETRY_S, MAX_RETRY_S
 from bms_estimator.sources.serial.port_list import NoPortError, PortBusyError, board_ports, resolve_port
-from bms_estimator.sources.source import Chunk
+from bms_estimator.sources.source import FIRST_RETRY_S, MAX_RETRY_S, Chunk
 
 if TYPE_CHECKING:
     import serial
@@ -24,6 +23,8 @@ if TYPE_CHECKING:
 
 WRONG_PORT_RETRY_S = 60.0
 """Time until a port with another device is reopened while there are other ports [s]. Opening may reset that device."""
+SILENT_PORT_RETRY_S = 10.0
+"""Time until a silent port is reopened while there are other ports [s]. Its board may have been starting or without power."""
 BUSY_PORT_RETRY_S = 1.0
 """Time until a port that could not be opened is retried [s]. The search of another pack may have opened it."""
 

@@ -12,7 +12,6 @@ import structlog
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.clock import since_boot
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.runtime import FIRST_RETRY_S
 from bms_estimator.protocols.base.reading_protocol import Command, DeviceProtocol
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.registry import make_protocol
@@ -20,8 +19,14 @@ from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.fault_log import FaultLog, SilenceLog
 from bms_estimator.sources.serial.board_check import BoardCheck, OtherBoardError
 from bms_estimator.sources.serial.port_list import KnownBoardFile, NoPortError, open_port
-from bms_estimator.sources.serial.serial_port import BUSY_PORT_RETRY_S, WRONG_PORT_RETRY_S, PortDiscovery, SerialPort
-from bms_estimator.sources.source import Chunk, ReadTap, ReceivedSamples, SourceHealth
+from bms_estimator.sources.serial.serial_port import (
+    BUSY_PORT_RETRY_S,
+    SILENT_PORT_RETRY_S,
+    WRONG_PORT_RETRY_S,
+    PortDiscovery,
+    SerialPort,
+)
+from bms_estimator.sources.source import FIRST_RETRY_S, Chunk, ReadTap, ReceivedSamples, SourceHealth
 
 if TYPE_CHECKING:
     import serial
@@ -179,14 +184,14 @@ class SerialSource:
         try:
             return self.board_check.accept(chunk, self._decoder)
         except OtherBoardError as error:
-            self._reject_device(f"{self._path}: refused: {error}")
+            self._reject_device(f"{self._path}: refused: {error}", WRONG_PORT_RETRY_S)
             return ()
 
-    def _reject_device(self, reason: str) -> None:
-        """Reject the device on the port and search elsewhere."""
+    def _reject_device(self, reason: str, retry_s: float) -> None:
+        """Reject the device on the port, and prefer other ports for ``retry_s``."""
         self._report(reason)
         self._rejected = True
-        self._discovery.skip_port(self._path, WRONG_PORT_RETRY_S)
+        self._discovery.skip_port(self._path, retry_s)
         self._port.lost.set()
 
     @property
@@ -317,17 +322,17 @@ class SerialSource:
             elif self._rejected:  # the reason is already reported
                 continue
             elif fault := self._current_decoder.fault:
-                self._report_or_reject(f"{path} at {self._settings.baud} baud: {fault}")
+                self._report_or_reject(f"{path} at {self._settings.baud} baud: {fault}", WRONG_PORT_RETRY_S)
             elif now_s - last_frame_s >= max(self._silence_limit_s, self._current_decoder.allowed_silence_s):
-                self._report_or_reject(f"{path}: open, but silent")
+                self._report_or_reject(f"{path}: open, but silent", SILENT_PORT_RETRY_S)
             self._fault_log.check(counters, now_s)
 
-    def _report_or_reject(self, reason: str) -> None:
-        """Report why no samples arrive. On a port that is not the preferred one, try other ports."""
+    def _report_or_reject(self, reason: str, retry_s: float) -> None:
+        """Report why no samples arrive. On a port that is not the preferred one, prefer other ports for ``retry_s``."""
         if self._discovery.is_preferred:
             self._report(reason)
         else:
-            self._reject_device(reason)
+            self._reject_device(reason, retry_s)
 
     async def _send_until_check(self) -> None:
         """Send due bytes until the next check, or until the port is lost."""

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.edge.block import Block, encode
-from bms_estimator.fleet.worker import block_processor, hour_summary
-from bms_estimator.fleet.worker import partition as partition_module
+from bms_estimator.fleet.worker import block_processor, hour_summary, partition as partition_module
 from bms_estimator.fleet.worker.block_processor import BlockProcessor
 from bms_estimator.fleet.worker.pack_alarms import PackAlarms
 from bms_estimator.fleet.worker.pack_records import PackRecords

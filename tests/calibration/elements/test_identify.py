@@ -14,7 +14,8 @@ from bms_estimator.calibration.ocv.overpotential import linear_interpolation_mat
 from bms_estimator.calibration.validate import validate
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import c_tl, c_ts, r_s, r_tl, r_ts
-from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.errors import UserError
 from bms_estimator.sources.captures.replay import load_capture

@@ -11,7 +11,8 @@ from bms_estimator.calibration.thesis.adaptive_run import adaptive_run
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import delta, ocv, r_s
-from bms_estimator.model.cell import Bounds, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import Bounds
 from bms_estimator.model.errors import UserError
 from bms_estimator.reports.thesis.simulation import discharge, with_bounds
 from bms_estimator.settings.observer import SCHEME_2_LAMBDA, IdentifierSettings, ObserverSettings

@@ -17,7 +17,7 @@ from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import ocv_of_each
 from bms_estimator.model.arrays import capture_digest
 from bms_estimator.model.cell import load_cell
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.simulation.simulated_pack import PackWithRelay
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, read_capture, read_header
@@ -99,7 +99,7 @@ class MeasuredPack:
         try:
             yield
         finally:
-            await end(task)
+            await end_tasks(task)
 
     def _recorded_bytes(self):
         return sum(path.stat().st_size for path in self._folder.glob("*.bms"))

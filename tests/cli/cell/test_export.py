@@ -9,7 +9,8 @@ import pytest
 from bms_estimator.checkpoint.state_files import CheckpointFile
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.estimator.estimator import Estimator, compiled_estimator
-from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from tests.command_line import run
 from tests.estimator.anywhere.cases import OXIDE, Case, capture
 

@@ -7,7 +7,7 @@ import pytest
 
 from bms_estimator.cli.cell.load_switch import LoadSwitch, relay_program
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from tests.patience import until
 
 
@@ -25,7 +25,7 @@ async def test_the_program_is_called_with_each_change_and_at_the_end(tmp_path) -
     await until(calls.exists)
     switch.request(on=True)
     await until(lambda: calls.read_text() == "off\non\n")
-    await end(running)
+    await end_tasks(running)
     await switch.release()
     assert calls.read_text() == "off\non\noff\n"
 
@@ -44,6 +44,6 @@ async def test_a_load_that_cannot_be_disconnected_is_an_error(tmp_path) -> None:
     switch.request(on=True)
     running = asyncio.create_task(switch.run())
     await until(lambda: not switch.error)
-    await end(running)
+    await end_tasks(running)
     with pytest.raises(UserError, match=r"could not be disconnected: .* off: exit code 1; disconnect it now"):
         await switch.release()

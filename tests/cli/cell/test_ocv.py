@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import PchipInterpolator
 
-from bms_estimator.model.cell import ChenMoraOcv, TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import ChenMoraOcv, TableOcv
 from tests.calibration.simulated_relaxation import INVALID_CAPTURES, relaxation
 from tests.command_line import run
 

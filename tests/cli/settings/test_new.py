@@ -14,8 +14,8 @@ from urllib.parse import quote
 import pytest
 
 from bms_estimator.protocols.firmware.messages import Hello
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.observer import ChargeLimits
-from bms_estimator.settings.outputs import MqttSettings
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_pack import SimulatedBms
@@ -72,6 +72,7 @@ def options(**changes: str | None) -> list[str]:
 def dialog(path: str) -> list[tuple[str, str, str]]:
     """Return questions, answers and replies of a session in which each kind of wrong answer occurs."""
     return [
+        ("Where to search", path, f"searching {path}: up to 20 s"),
         ("Number of the device", "7", "7: was not found"),
         ("Number of the device", "/dev/none", "-  /dev/none: cannot be opened: No such file or directory\n"),
         ("Number of the device", "mqtt://localhost:99999", "Port out of range"),
@@ -118,7 +119,7 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
 
 
 def test_wizard_asks_again_after_wrong_answers_and_writes_the_file(file):
-    with running_device(jk_bms()) as path, PseudoTerminal("new", str(file), "--search", path, columns=200) as terminal:
+    with running_device(jk_bms()) as path, PseudoTerminal("new", str(file), columns=200) as terminal:
         for question, answer, reply in dialog(path):
             terminal.until(lambda question=question: re.search(f"{question}[^\n]*[:?] $", plain(terminal.output)))
             terminal.output = ""
@@ -213,17 +214,14 @@ def test_an_existing_file_is_not_changed(file, capsys):
     assert file.read_text() == "mine\n"
 
 
-def test_a_port_without_a_device_is_reported_with_the_reason(file, capsys, tmp_path):
-    code, out, err = run(capsys, "new", file, "--search", tmp_path / "none", "--yes")
-    assert code == 2
-    assert f"-  {tmp_path / 'none'}: cannot be opened" in out
-    assert "--search: no device was found" in err
-
-
-def test_a_named_port_without_a_device_is_reported_with_its_option(file, capsys, tmp_path):
-    code, _, err = run(capsys, "new", file, "--device", tmp_path / "none", "--yes")
-    assert code == 2
-    assert err.startswith(f"error: --device {tmp_path / 'none'}: cannot be opened")
+@pytest.mark.parametrize(
+    ("option", "error"),
+    [("--search", "--search: no device was found"), ("--device", "--device /dev/no: cannot be opened")],
+)
+def test_a_port_without_a_device_is_reported_with_the_reason_and_the_option(file, capsys, option, error):
+    code, out, err = run(capsys, "new", file, option, "/dev/no", "--yes")
+    assert (code, err.startswith(f"error: {error}")) == (2, True)
+    assert "-  /dev/no: cannot be opened" in out
 
 
 @pytest.mark.parametrize(

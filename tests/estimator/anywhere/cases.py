@@ -15,7 +15,8 @@ from scipy.optimize import nnls
 from bms_estimator.calibration.ocv.hysteresis import RESTED_FRACTION_STD
 from bms_estimator.kernels.cell_model.rc_ladder import HIGH_ACTIVATION_ENERGY, LOW_ACTIVATION_ENERGY, TAU_S, arrhenius
 from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock
-from bms_estimator.model.cell import CellModel, Ladder, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import Ladder, TableOcv
 from tests.estimator.anywhere.truth import (
     GRID,
     Truth,

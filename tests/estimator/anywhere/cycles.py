@@ -17,7 +17,8 @@ from scipy.interpolate import PchipInterpolator
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.kalman_filter.records import LN_Q
 from bms_estimator.model.arrays import SAMPLE, Floats, SampleBlock
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.pack.pack import Pack
 from bms_estimator.pack_model.slow_fit import SlowFit
 from tests.estimator.anywhere.cases import OXIDE, PHOSPHATE, rising

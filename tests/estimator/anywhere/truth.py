@@ -13,7 +13,8 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.numba_cache import njit
 
 GRID = np.linspace(0.0, 1.0, 401)

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from bms_estimator.model.arrays import Floats
-from bms_estimator.model.cell import CellModel, TableOcv, load_cell
+from bms_estimator.model.cell import CellModel, load_cell
+from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.sources.captures.replay import load_capture
 from tests.estimator.anywhere.cases import OCV_STD_V, OXIDE, PHOSPHATE, own_file
 from tests.estimator.anywhere.cycles import Cycle, total_ohm, true_curve

@@ -17,8 +17,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.edge.block import decode
 from bms_estimator.edge.block_sender import BlockSender
 from bms_estimator.edge.subjects import BlockRequest
-from bms_estimator.fleet.ingest import ingest as ingest_module
-from bms_estimator.fleet.ingest import telemetry_reader
+from bms_estimator.fleet.ingest import ingest as ingest_module, telemetry_reader
 from bms_estimator.fleet.ingest.batch_reports import BatchReport
 from bms_estimator.fleet.ingest.batch_samples import BatchSamples, Selection
 from bms_estimator.fleet.ingest.ingest_store import FILE, IngestStore
@@ -29,7 +28,7 @@ from bms_estimator.fleet.packs.pack_bucket import remove_keys
 from bms_estimator.fleet.packs.pack_registry import UNKNOWN_PACK
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.clock import Clock
-from bms_estimator.settings.outputs import EdgeSettings
+from bms_estimator.settings.connections import EdgeSettings
 from bms_estimator.sources.captures.tables.layout_finder import parse_column_map
 from tests.fleet.ingest.platform import (
     START_S,
@@ -78,7 +77,7 @@ async def send_by_edge(cluster: NatsCluster, folder: Path, pack: str, rows: Samp
             now_s = float(part["time_s"][-1])
             part["time_s"] -= START_S
             edge.take(part)
-        await until(lambda: edge.store.waiting == 0 and edge.store.unconfirmed, edge.health)
+        await until(lambda: edge.queue.waiting == 0 and edge.queue.unconfirmed, edge.health)
 
 
 async def test_states_of_packs_with_ingest_and_with_an_edge_are_equal(

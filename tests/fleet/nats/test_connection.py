@@ -11,7 +11,7 @@ import pytest
 from bms_estimator.fleet.nats import connection
 from bms_estimator.fleet.nats.connection import close, connect, run_connected
 from bms_estimator.fleet.server.nats_config import Tls
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from tests.fleet.nats_cluster import running
 from tests.mqtt.certificates import Authority
 from tests.patience import LONG_S
@@ -109,7 +109,7 @@ async def test_cancelled_connecting_closes_the_socket() -> None:
         connecting = asyncio.create_task(connect(f"nats://127.0.0.1:{server.sockets[0].getsockname()[1]}", "x"))
         await accepted.wait()
         async with asyncio.timeout(LONG_S):
-            await end(connecting)
+            await end_tasks(connecting)
             await closed.wait()
 
 
@@ -122,4 +122,4 @@ async def _publish(nc, total_bytes: int) -> None:
 async def test_service_that_is_stopped_before_a_server_is_found_ends() -> None:
     stop = asyncio.Event()
     asyncio.get_running_loop().call_soon(stop.set)
-    await asyncio.wait_for(run_connected(close, stop, "w", ("nats://127.0.0.1:1", None, None)), LONG_S)
+    await asyncio.wait_for(run_connected(close, stop, connect("nats://127.0.0.1:1", "w")), LONG_S)

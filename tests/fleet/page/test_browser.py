@@ -27,7 +27,7 @@ from bms_estimator.fleet.page.nats_feed import FleetFeed, Server
 from bms_estimator.fleet.page.view import FleetView
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.input_faults import InputFault
-from bms_estimator.settings.outputs import PageSettings
+from bms_estimator.settings.connections import PageSettings
 from tests.fleet.hour_rows import BEGIN, FIRST_STD, estimate_capacities, write_fleet
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.published_states import HOME, VAN, Pack, load, publish, publish_heartbeat, state

@@ -19,7 +19,7 @@ from bms_estimator.fleet.nats.stream_snapshot import read_info
 from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.server.backup import BACKUP_ORDER, back_up, restore
 from bms_estimator.fleet.worker.checkpoint.claims import Claims
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.partition_stream import estimates_of
@@ -124,7 +124,7 @@ async def back_up_while_blocks_arrive(nc: Client, folder: Path) -> None:
         before = number
         await until(lambda: number >= before + 2, lambda: number)
     finally:
-        await end(sending)
+        await end_tasks(sending)
 
 
 async def checkpoint_sequences(nc: Client) -> list[int]:

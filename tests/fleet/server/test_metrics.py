@@ -16,7 +16,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from bms_estimator.fleet.metrics.families import NODE, TENANT, WORKER
-from bms_estimator.fleet.server.metrics_endpoint import metrics_endpoint
+from bms_estimator.fleet.server.node_watch import metrics_endpoint
 from tests.fleet.serve_process import ServeProcess
 from tests.fleet.workers import PERIOD_S, SAMPLES, Process, block, load_packs, send
 from tests.free_port import free_port

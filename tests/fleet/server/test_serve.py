@@ -21,10 +21,9 @@ from structlog.testing import capture_logs
 
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.nats.streams import NoAnswerError
-from bms_estimator.fleet.server import credentials, nats_server, tenant_streams, tenant_watch
+from bms_estimator.fleet.server import credentials, nats_server, tenant_watch
 from bms_estimator.fleet.server.jwt_claims import Role
-from bms_estimator.fleet.server.nats_server import serve as serve_node
-from bms_estimator.fleet.server.nats_server import warn_of_open_file_limit
+from bms_estimator.fleet.server.nats_server import serve as serve_node, warn_of_open_file_limit
 from bms_estimator.fleet.server.node_spec import NodeLocation, ServerSpec
 from bms_estimator.model.config_file import read_toml
 from bms_estimator.model.errors import UserError
@@ -193,7 +192,7 @@ def is_listening(port: int) -> bool:
 async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_answer_at_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls, original_make_streams = [], tenant_streams.make_streams
+    calls, original_make_streams = [], nats_server.make_streams
 
     async def fail_once(nc, **options) -> None:
         calls.append(options)
@@ -201,7 +200,7 @@ async def test_streams_are_created_by_a_second_attempt_if_the_server_does_not_an
             raise NoAnswerError("no answer")
         await original_make_streams(nc, **options)
 
-    monkeypatch.setattr(tenant_streams, "make_streams", fail_once)
+    monkeypatch.setattr(nats_server, "make_streams", fail_once)
     ports = {name: f"127.0.0.1:{free_port()}" for name in ("listen", "mqtt", "monitor")}
     spec = ServerSpec(FleetSettings(server=ServerSettings(**ports, partitions=4)))
     lines: list[str] = []

@@ -14,7 +14,7 @@ from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.simulation.block_publisher import Report, run_edges
 from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import SimulatedFleet
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from tests.command_line import run
 from tests.fleet.nats_cluster import running
 from tests.patience import LONG_S

@@ -3,7 +3,7 @@
 import asyncio
 
 from bms_estimator.fleet.worker.block_loop import BlockLoop
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 
 
 class Messages:
@@ -29,7 +29,7 @@ async def test_other_tasks_run_while_messages_wait() -> None:
     running = asyncio.create_task(loop.run())
     for _ in range(5):
         await messages.published.get()  # returns only if the loop does not occupy the event loop
-    await end(running)
+    await end_tasks(running)
 
 
 async def test_partitions_are_served_in_turn() -> None:
@@ -41,7 +41,7 @@ async def test_partitions_are_served_in_turn() -> None:
     while await few.published.get() < 3:
         pass
     assert order[:6] == [endless, few] * 3
-    await end(running)
+    await end_tasks(running)
 
 
 async def test_no_message_is_processed_while_the_lock_is_held() -> None:
@@ -53,4 +53,4 @@ async def test_no_message_is_processed_while_the_lock_is_held() -> None:
             await asyncio.sleep(0)
         assert messages.processed == 0
     assert await messages.published.get() == 1
-    await end(running)
+    await end_tasks(running)

@@ -41,11 +41,11 @@ def test_source_at_1000_hz_stays_within_its_budget() -> None:
 
 
 def test_number_of_stored_packs_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(block_runner, "MAX_PACKS", 10)
+    monkeypatch.setattr(block_runner, "MAX_LEVELS", 10)
     clock = ManualClock()
     budget = CpuBudget(clock)
     for number in range(100):
         clock.now_s += 1.0
         budget.charge(f"p{number}", 0.01)
     # besides the limit, the pack that was charged last is stored
-    assert len(budget._levels) <= block_runner.MAX_PACKS + 1
+    assert len(budget._levels) <= block_runner.MAX_LEVELS + 1

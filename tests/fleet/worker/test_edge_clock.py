@@ -18,7 +18,7 @@ from bms_estimator.fleet.worker.block_order import MAX_AHEAD_S, MAX_BEHIND_S
 from bms_estimator.fleet.worker.partition import Partition
 from bms_estimator.fleet.worker.pinned_consumer import parse_position
 from bms_estimator.model.arrays import SAMPLE
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from tests.command_line import running_program
 from tests.edge.test_edge_process import Board, write_pack_file
 from tests.fleet.partition_stream import STORE_ID_NS, one_block, table
@@ -252,7 +252,7 @@ async def test_edge_whose_clock_steps_back_by_days_loses_no_sample_and_is_not_si
         assert await worker.end() == 0
     finally:
         worker.kill()
-        await end(board)
+        await end_tasks(board)
     stored = [each async for batch in read_stream(nc, subjects.HOURS_STREAM, ">") for each in batch]
     rows = [Hour.model_validate_json(each.data) for each in stored]
     first_store, last_store = sorted({store for store, _ in blocks})

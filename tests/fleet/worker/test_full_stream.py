@@ -23,7 +23,7 @@ from bms_estimator.fleet.simulation.simulated_edges import SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker import worker as worker_module
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import open_checkpoints
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from tests.command_line import run
 from tests.fleet.checkpoints import damage
 from tests.fleet.nats_cluster import connected, running

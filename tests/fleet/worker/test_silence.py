@@ -21,7 +21,7 @@ from bms_estimator.fleet.worker.pinned_consumer import PinnedConsumer
 from bms_estimator.fleet.worker.table_in_force import PackLookup
 from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS
 from bms_estimator.fleet.worker.worker import Options, work
-from bms_estimator.process.runtime import end, until_first_ends
+from bms_estimator.process.runtime import end_tasks, until_first_ends
 from tests.fleet.nats_cluster import running
 from tests.fleet.partition_stream import estimates_of
 from tests.fleet.workers import Heartbeats, block, end_states, estimated, load_packs, send, until
@@ -176,7 +176,7 @@ async def _running_lease(nc: Client, table: PackLookup, blocks: int) -> AsyncGen
     try:
         yield lease
     finally:
-        await end(running_lease)
+        await end_tasks(running_lease)
 
 
 async def _claim_without_checkpoint(nc: Client, claims: int) -> None:

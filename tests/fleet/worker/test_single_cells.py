@@ -20,9 +20,9 @@ from bms_estimator.pack.pack import assemble
 from bms_estimator.pack_model.slow_fit import SlowFit
 from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
-from bms_estimator.telemetry.cells import estimate_fields, remaining_capacity_ah
+from bms_estimator.telemetry.cells import estimate_fields
 from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter, Window
-from bms_estimator.telemetry.state import NAMES, make_state_payload
+from bms_estimator.telemetry.state import NAMES, make_state_payload, remaining_capacity_ah
 from tests.fleet.partition_stream import STORE_ID_NS, estimates_of
 
 CELLS, CAPACITY_AH, WEAK = 4, 20.0, 2

@@ -11,7 +11,7 @@ from bms_estimator.cli.fleet import status as status_command
 from bms_estimator.edge import subjects
 from bms_estimator.fleet.heartbeat import Heartbeat
 from bms_estimator.fleet.nats.streams import make_streams
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from tests.command_line import run
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.patience import LONG_S
@@ -38,7 +38,7 @@ async def sending(url: str, *heartbeats: bytes) -> AsyncIterator[None]:
     async with await nats.connect(url) as nc:
         task = asyncio.create_task(send(nc))
         yield
-        await end(task)
+        await end_tasks(task)
 
 
 async def status(capsys: pytest.CaptureFixture[str], url: str, *options: object) -> tuple[int, str, str]:

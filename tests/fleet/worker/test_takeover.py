@@ -9,7 +9,7 @@ from bms_estimator.edge import subjects
 from bms_estimator.fleet.worker.checkpoint.checkpoint_format import FORMAT
 from bms_estimator.fleet.worker.checkpoint.checkpoint_store import CheckpointStore
 from bms_estimator.fleet.worker.takeover import GUARDED_CLAIMS, MAX_DEATHS, ReplayGuard
-from bms_estimator.process.runtime import end
+from bms_estimator.process.runtime import end_tasks
 from tests.fleet.checkpoints import raw
 
 END_SEQUENCE = 9
@@ -64,7 +64,7 @@ async def test_worker_that_is_stopped_in_a_guarded_replay_can_write_its_checkpoi
     beginning = asyncio.create_task(guard.begin_block(5))
     for _ in range(3):  # until it waits for the receipt
         await asyncio.sleep(0)
-    await end(beginning)
+    await end_tasks(beginning)
     await store.claims.read(0)  # not possible if the connection is no longer read
 
 

@@ -31,9 +31,9 @@ from bms_estimator.fleet.simulation.block_publisher import run_edges
 from bms_estimator.fleet.simulation.simulated_edges import RESEND_S, SimulatedEdges
 from bms_estimator.fleet.simulation.simulated_fleet import BLOCK_S, SimulatedFleet
 from bms_estimator.fleet.worker.block_order import REQUEST_EVERY
-from bms_estimator.fleet.worker.heartbeats import assign_partitions
+from bms_estimator.fleet.worker.membership import assign_partitions
 from bms_estimator.fleet.worker.partition import Partition
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.workers import Fitter, Heartbeats, Process, end_states
 from tests.patience import LONG_S

@@ -6,14 +6,14 @@ a10).
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.integrate import solve_ivp
 
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model import chen_mora as kernel
 from bms_estimator.kernels.cell_model.chen_mora import delta
-from bms_estimator.model.cell import TableOcv, load_cell
+from bms_estimator.model.cell import load_cell
+from bms_estimator.model.cell_sections import TableOcv
 
 CHEN_MORA = load_cell("chen_mora")
 PARAMETERS = CHEN_MORA.a

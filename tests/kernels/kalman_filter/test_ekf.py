@@ -15,8 +15,7 @@ from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
-from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, temperature, window
-from bms_estimator.kernels.kalman_filter import noise as ekf_noise
+from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, noise as ekf_noise, temperature, window
 from bms_estimator.kernels.kalman_filter.mixture import merge_pair, mixture_moments, prune_and_merge
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.model.arrays import SAMPLE, SampleBlock

@@ -5,8 +5,7 @@ theta is ln of each parameter over its value in the cell file, psi the derivativ
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.kernels.cell_model import chen_mora as elements
 from bms_estimator.kernels.observer import chen_mora_sensitivity, learning_law

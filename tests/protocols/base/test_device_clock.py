@@ -4,8 +4,7 @@ import itertools
 from math import nan
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.protocols.base.device_clock import MAX_FIRST_BACKLOG_S, MAX_LEAD_S, DeviceClock
 from bms_estimator.protocols.devices.text import TextProtocol

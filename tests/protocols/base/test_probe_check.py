@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.model.arrays import SAMPLE, SampleStatus
 from bms_estimator.protocols.base.probe_check import COOLING_K_PER_S, CheckedProbes, ProbeCheck

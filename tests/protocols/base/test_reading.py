@@ -3,8 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.protocols.base.reading import Reading, read_line, sample_json_line
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, DeviceProtocol, ReadingProtocol

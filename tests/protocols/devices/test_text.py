@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bms_estimator.model.arrays import NO_CELLS, SampleBlock, SampleStatus
 from bms_estimator.protocols.devices.text import MAX_LINE_BYTES, TextProtocol

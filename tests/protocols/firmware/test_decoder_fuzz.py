@@ -7,8 +7,7 @@ import struct
 import numpy as np
 import pytest
 from cobs import cobs
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.protocols.firmware.frame_decoder import FrameCounters, FrameDecoder

@@ -14,7 +14,7 @@ import structlog
 
 from bms_estimator.model.errors import TemporaryError
 from bms_estimator.model.payloads.snapshot import Snapshot
-from bms_estimator.settings.outputs import InfluxSettings
+from bms_estimator.settings.connections import InfluxSettings
 from bms_estimator.sinks.exports.influx import BATCH_LINES, MAX_WAITING, InfluxSink, lines
 from tests.influxdb import InfluxDB
 from tests.patience import until

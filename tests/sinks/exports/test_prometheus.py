@@ -15,7 +15,7 @@ from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.health import Health
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.process import listener
-from bms_estimator.settings.outputs import PrometheusSettings
+from bms_estimator.settings.connections import PrometheusSettings
 from tests.free_port import free_port
 from tests.patience import LONG_S
 from tests.prometheus import PROMTOOL, promtool
@@ -139,7 +139,7 @@ def test_invalid_address_is_rejected(listen: str) -> None:
 
 def test_ipv4_and_ipv6_addresses_are_accepted() -> None:
     settings: Any = [PrometheusSettings(listen=listen) for listen in ("127.0.0.1:9108", "[::1]:1")]
-    assert [(each.host, each.port) for each in settings] == [("127.0.0.1", 9108), ("::1", 1)]
+    assert [each.address for each in settings] == [("127.0.0.1", 9108), ("::1", 1)]
 
 
 async def test_slow_name_lookup_does_not_block_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:

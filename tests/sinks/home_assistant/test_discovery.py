@@ -13,7 +13,7 @@ from bms_estimator.calibration.fuel_cell_fit import KEYS
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Alarm, Parameter, Snapshot
 from bms_estimator.settings.alarms import ALARMS
-from bms_estimator.settings.outputs import HomeAssistantSettings
+from bms_estimator.settings.connections import HomeAssistantSettings
 from bms_estimator.sinks.home_assistant.discovery import DiscoveryInputs, discovery
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from tests.sinks.snapshots import CELL_SNAPSHOT, STACK_SNAPSHOT

@@ -11,7 +11,7 @@ import structlog
 from bms_estimator.mqtt.connection import BrokerConnectionError, ConnectOptions, DeliveryStats, brokers
 from bms_estimator.mqtt.queue_sender import WINDOW
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector
-from bms_estimator.settings.outputs import BrokerSettings, MqttSettings
+from bms_estimator.settings.connections import BrokerSettings, MqttSettings
 from bms_estimator.settings.sources.mqtt import SourceBroker
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import MqttSink

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 import structlog
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.model.errors import UserError
 from bms_estimator.mqtt.connection import DeliveryStats

@@ -29,7 +29,7 @@ from bms_estimator.mqtt.connection import (
 from bms_estimator.mqtt.receive_queue import ReceiveQueue
 from bms_estimator.mqtt.reconnect_loop import BrokerConnector, ReconnectLoop
 from bms_estimator.process.runtime import MAX_DELAY_S
-from bms_estimator.settings.outputs import MqttSettings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.sinks.mqtt.requests import RequestDispatcher
 from bms_estimator.sinks.mqtt.sink import CORRECTION_S, MqttSink
 from bms_estimator.store.outbox import Outbox

@@ -7,8 +7,7 @@ from pathlib import Path
 import cantools
 import pytest
 from cantools.database.can import Database
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
 from bms_estimator.model.errors import UserError

@@ -5,8 +5,7 @@ import math
 import struct
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
 from bms_estimator.settings.sources.fieldbus import MAX_WORDS, MODBUS_PROFILES, CellRegisters, ModbusSource, Register

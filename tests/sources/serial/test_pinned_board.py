@@ -7,7 +7,7 @@ import os
 import shutil
 import stat
 import tty
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,15 @@ from serial.tools import list_ports
 from structlog.testing import capture_logs
 
 from bms_estimator.model.arrays import SampleBlock
+from bms_estimator.model.clock import since_boot
+from bms_estimator.process.runtime import end_tasks
 from bms_estimator.protocols.firmware.messages import MessageType
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import board_check, port_list, serial_source
 from bms_estimator.sources.serial.port_list import NO_BOARD, KnownBoardFile
+from bms_estimator.sources.serial.serial_port import SILENT_PORT_RETRY_S
 from bms_estimator.sources.serial.serial_source import SerialSource
 from tests.command_line import run
 from tests.patience import until
@@ -65,11 +68,18 @@ class RecordingSource(SerialSource):
 
 @contextlib.asynccontextmanager
 async def source(
-    port: Path | str, memory: KnownBoardFile | None = None, **settings: Any
+    port: Path | str,
+    memory: KnownBoardFile | None = None,
+    monotonic: Callable[[], float] = since_boot,
+    **settings: Any,
 ) -> AsyncIterator[RecordingSource]:
     """Run a source that stores its blocks."""
     reader = RecordingSource(
-        SensorSettings(port=str(port), **settings), board_file=memory, first_retry_s=0.05, silent_s=0.3
+        SensorSettings(port=str(port), **settings),
+        board_file=memory,
+        monotonic=monotonic,
+        first_retry_s=0.05,
+        silent_s=0.3,
     )
     reader.blocks = []
 
@@ -207,6 +217,23 @@ async def test_search_for_the_board_sends_nothing_to_a_silent_device(port_folder
     finally:
         os.close(slave)
         os.close(master)
+
+
+async def test_board_that_started_after_its_port_was_opened_is_found_before_other_devices_are_tried_again(
+    port_folder: Path,
+) -> None:
+    now_s = 0.0
+    async with source(port_folder / "gone", serial="00000001", monotonic=lambda: now_s) as reader:
+        with VirtualBoard(lambda _: Reading(current_a=0.5, voltage_v=OURS_V, temperature_c=25.0)) as late:
+            (port_folder / "a").symlink_to(late.path)
+            async with board(port_folder / "b", serial=2):
+                await until(lambda: reader._path == str(port_folder / "a"))
+                now_s = 1.0  # more than the time after which the port counts as silent
+                await until(lambda: len(reader._discovery._skipped) == 2)
+                starting = asyncio.create_task(late.run())
+                now_s += SILENT_PORT_RETRY_S
+                await until(lambda: reader.blocks)
+                await end_tasks(starting)
 
 
 async def test_changed_calibration_is_reported_before_it_is_stored(

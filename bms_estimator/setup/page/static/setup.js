@@ -6,8 +6,11 @@ if (wait) {
 	new EventSource("events").onmessage = (event) => {
 		const { estimate } = JSON.parse(event.data);
 		if (!estimate) return;
+		const { unknown, ...values } = estimate;
 		wait.hidden = true;
-		for (const [name, value] of Object.entries(estimate))
+		document.getElementById("known").hidden = unknown;
+		document.getElementById("unknown").hidden = !unknown;
+		for (const [name, value] of Object.entries(values))
 			document.querySelector(`[data-q="${name}"]`).textContent = value === null ? "–" : value.toFixed(name === "soc" || name === "band" ? 1 : 2);
 	};
 }

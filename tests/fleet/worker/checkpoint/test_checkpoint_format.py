@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bms_estimator.fleet.packs.table_change import PackSource
 from bms_estimator.fleet.worker import pack_records

@@ -6,8 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from nats.aio.client import Client
 
 from bms_estimator.fleet.nats.checkpoint_pointer import CheckpointPointer

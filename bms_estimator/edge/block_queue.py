@@ -1,6 +1,8 @@
-"""Store of the blocks of one pack or many. A block stays on disk until a worker has confirmed it, and is sent again on request.
+"""Queue on disk with the blocks of one pack or many. A block stays until a worker has confirmed it, and is sent again on request.
 
-The event loop never waits for the disk. Blocks that cannot be written wait in memory without a number. A block is sent
+A *store* is the series of the numbered blocks of one pack since a creation time, which identifies it in blocks and requests.
+
+The event loop never waits for the disk. Blocks wait in memory without a number until they are written. A block is sent
 only after its number is on disk, since a restart could otherwise use the number again.
 """
 
@@ -16,7 +18,7 @@ import structlog
 from bms_estimator.edge.batching import ReadyBlock
 from bms_estimator.edge.block import MAX_NUMBER, with_oldest
 from bms_estimator.edge.block_table import (
-    LATEST_S,
+    MAX_CREATED_S,
     NS_PER_S,
     BlockRange,
     PackPosition,
@@ -51,15 +53,15 @@ class _Pack:
     """Block number and time of the last resend."""
 
 
-class BlockStore:
-    """Store of blocks, in order for each pack, until a worker has confirmed them; implements ``mqtt.queue_sender.MessageQueue``.
+class BlockQueue:
+    """Queue of blocks, in order for each pack, until a worker has confirmed them; implements ``mqtt.queue_sender.MessageQueue``.
 
     Args:
         database: Database with ``EDGE_TABLES`` or ``INGEST_TABLES``, synced at each transaction; its owner opens and closes it.
         topic: Function that returns the topic of a pack's blocks.
         max_blocks: Maximum number of blocks of a pack on disk. Beyond it, the pack's oldest block is dropped.
         max_bytes: Maximum size of the database [bytes]. Beyond it, the oldest block is dropped.
-        max_waiting: Maximum number of samples in memory after the disk has failed. Beyond it, the oldest block is dropped.
+        max_unwritten: Maximum number of samples in memory after the disk has failed. Beyond it, the oldest block is dropped.
         resend_s: Minimum interval between two resends of one block [s].
 
     Attributes:
@@ -76,14 +78,14 @@ class BlockStore:
         *,
         max_blocks: int = MAX_NUMBER,
         max_bytes: float = math.inf,
-        max_waiting: float = math.inf,
+        max_unwritten: float = math.inf,
         resend_s: float = RESEND_S,
     ) -> None:
         self._database, self._topic = database, topic
-        self._max_blocks, self._max_bytes, self._max_waiting = max_blocks, max_bytes, max_waiting
+        self._max_blocks, self._max_bytes, self._max_unwritten = max_blocks, max_bytes, max_unwritten
         self._resend_s = resend_s
         self._packs = dict[str, _Pack]()
-        self._waiting = list[tuple[str, ReadyBlock]]()  # blocks that are not on disk yet
+        self._unwritten = list[tuple[str, ReadyBlock]]()  # blocks that are not on disk yet
         self._unsent = dict[str, None]()  # packs with blocks on disk from their cursor on, in the order of sending
         self._repeats = list[BlockRange]()  # single blocks to send again
         self._in_flight = dict[int, tuple[str, int]]()  # pack and number of sent blocks, by number of the message
@@ -111,20 +113,20 @@ class BlockStore:
     def unconfirmed_of(self, pack: str) -> int:
         """Return the number of blocks of a pack that no worker has confirmed."""
         position = self.position(pack)
-        return position.next_number - position.oldest + sum(each == pack for each, _ in self._waiting)
+        return position.next_number - position.oldest + sum(each == pack for each, _ in self._unwritten)
 
     @property
     def unconfirmed(self) -> int:
         """Number of blocks that no worker has confirmed."""
         positions = (pack.position for pack in self._packs.values())
-        return len(self._waiting) + sum(position.next_number - position.oldest for position in positions)
+        return len(self._unwritten) + sum(position.next_number - position.oldest for position in positions)
 
     @property
     def waiting(self) -> int:
         """Number of blocks that the broker has not acknowledged."""
         unsent = (self._packs[pack] for pack in self._unsent)
         ready = sum(pack.position.next_number - pack.cursor for pack in unsent)
-        return len(self._waiting) + ready + len(self._in_flight)
+        return len(self._unwritten) + ready + len(self._in_flight)
 
     def add_pack(self, pack: str, position: PackPosition) -> None:
         """Set the position of a pack that is not stored."""
@@ -136,13 +138,13 @@ class BlockStore:
         """Remove a pack and its blocks."""
         self._forget_sent(pack)
         self._packs.pop(pack, None)
-        self._waiting = [waiting for waiting in self._waiting if waiting[0] != pack]
+        self._unwritten = [each for each in self._unwritten if each[0] != pack]
         self._changed.discard(pack)
         self._removed.add(pack)
 
     def put(self, pack: str, ready: ReadyBlock) -> None:
         """Append a block, with times in seconds since 1970, without waiting for the disk. ``sync`` writes it."""
-        self._waiting.append((pack, ready))
+        self._unwritten.append((pack, ready))
 
     def on_request(self, pack: str, request: BlockRequest) -> None:
         """Handle a worker's request for the next block of a pack. A request for an unknown pack is ignored."""
@@ -207,22 +209,25 @@ class BlockStore:
 
     async def sync(self, progress: Progress | None = None) -> bool:
         """Write all changes to disk, after the first call has read the state of an earlier run. Return False if the disk failed."""
-        waiting = self._waiting.copy()
+        unwritten = self._unwritten.copy()
         changed, self._changed = self._changed, set()
         removed, self._removed = self._removed, set()
         try:
             if not self._open_count:
                 await self._load()
-            changed.update(pack for pack, _ in waiting)
+            changed.update(pack for pack, _ in unwritten)
             if changed or removed or (progress or self.progress) != self.progress:
-                await self._write(waiting, changed, removed, progress or self.progress)
+                await self._write(unwritten, changed, removed, progress or self.progress)
         except BaseException as error:
-            self._changed |= changed
+            self._changed |= changed & self._packs.keys()  # without packs that were removed meanwhile
             self._removed |= removed
             if not isinstance(error, StoreError):
                 raise
-            while len(self._waiting) > 1 and sum(block.samples.size for _, block in self._waiting) > self._max_waiting:
-                del self._waiting[0]
+            while (
+                len(self._unwritten) > 1
+                and sum(block.samples.size for _, block in self._unwritten) > self._max_unwritten
+            ):
+                del self._unwritten[0]
                 self._count_lost(1, "the disk cannot be written, and memory is full")
             return False
         return True
@@ -235,29 +240,31 @@ class BlockStore:
             self.add_pack(pack, position)
 
     async def _write(
-        self, waiting: Sequence[tuple[str, ReadyBlock]], changed: set[str], removed: set[str], progress: Progress
+        self, unwritten: Sequence[tuple[str, ReadyBlock]], changed: set[str], removed: set[str], progress: Progress
     ) -> None:
-        """Write the first waiting blocks and all changed positions."""
+        """Write the unwritten blocks and all changed positions."""
         packs = {pack: self._packs.setdefault(pack, _Pack(PackPosition())) for pack in changed}
         before = {pack: entry.position for pack, entry in packs.items()}
         write = functools.partial(
             write_changes,
             positions=before,
-            waiting=waiting,
+            unwritten=unwritten,
             removed=removed,
             progress=progress,
             max_blocks=self._max_blocks,
             max_bytes=self._max_bytes,
         )
         after = await self._database.call(write)
-        del self._waiting[: len(waiting)]
+        # blocks that went into a store that was replaced meanwhile stay in memory, and are written to the new one
+        written = {id(block) for pack, block in unwritten if self._packs.get(pack) is packs[pack]}
+        self._unwritten = [each for each in self._unwritten if id(each[1]) not in written]
         self.progress = progress
         if self._open_count != self._database.open_count:  # a damaged or deleted file was replaced by an empty one
             self._open_count = self._database.open_count
             self._changed.update(self._packs)
         for pack, position in after.items():
             entry = self._packs.get(pack)
-            if entry is packs[pack]:  # else a new store was begun meanwhile
+            if entry is packs[pack]:  # else the pack was removed, or a new store was begun meanwhile
                 self._count_lost(position.oldest - before[pack].oldest, "the store is full or damaged")
                 sent, oldest = max(position.sent, entry.position.sent), max(position.oldest, entry.position.oldest)
                 entry.position = position._replace(sent=sent, oldest=oldest)
@@ -301,7 +308,7 @@ class BlockStore:
         """
         position, first_s = self.position(pack), math.ceil(other_ns / NS_PER_S) + 1
         is_begun = not position.created_s and position.last_s >= first_s
-        if first_s > LATEST_S or is_begun:
+        if first_s > MAX_CREATED_S or is_begun:
             return
         log.warning("a worker has later blocks of this pack than this store: a new store is begun", pack=pack)
         self._count_lost(position.next_number - position.oldest, "a new store is begun")

@@ -1,4 +1,4 @@
-"""Settings of brokers with their credentials, of addresses to listen on, and of the outputs of a service: page and exports."""
+"""Settings of the connections of a service: brokers with their credentials, addresses to listen on, page, edge and exports."""
 
 import ipaddress
 import re
@@ -144,7 +144,7 @@ def parse_listen(text: str) -> ListenAddress:
         (host or "").encode("idna")  # the resolver encodes the name this way and would fail later
     except ValueError as error:
         raise ValueError(f"must be host:port: {error}") from None
-    if not host or port is None or url.netloc != text or "@" in text:
+    if not host or port is None or url.netloc != text or re.search(r"[@\s]", text):
         raise ValueError('must be host:port, such as "127.0.0.1:8765" or "[::1]:8765"')
     return ListenAddress(host, port)
 
@@ -158,7 +158,18 @@ Address = Annotated[str, AfterValidator(_validate_listen)]
 """Text ``host:port``."""
 
 
-class PageSettings(Strict):
+class ListenSettings(Strict):
+    """Address on which a server listens."""
+
+    listen: Address
+
+    @property
+    def address(self) -> ListenAddress:
+        """Host and port of ``listen``."""
+        return parse_listen(self.listen)
+
+
+class PageSettings(ListenSettings):
     """Live web page of the pack."""
 
     listen: Address = Field(
@@ -172,11 +183,6 @@ class PageSettings(Strict):
     hosts: tuple[str, ...] = Field(
         default=(), description="further host names under which browsers request the page, for example behind a proxy"
     )
-
-    @property
-    def address(self) -> ListenAddress:
-        """Host and port of ``listen``."""
-        return parse_listen(self.listen)
 
     @model_validator(mode="after")
     def _require_token_unless_local(self) -> Self:
@@ -248,27 +254,16 @@ class InfluxSettings(Strict):
         return self
 
 
-class PrometheusSettings(Strict):
+class PrometheusSettings(ListenSettings):
     """Endpoint from which Prometheus reads metrics."""
 
-    listen: Annotated[str, Field(pattern=r"^([^:\s/@]+|\[[0-9A-Fa-f:]+\]):\d{1,5}$")] = Field(
+    listen: Address = Field(
         default="127.0.0.1:9108",
         description="host:port of this pack's metrics; every client that can connect to it can read them",
     )
 
-    @property
-    def host(self) -> str:
-        """Host without brackets."""
-        return self.listen.rpartition(":")[0].strip("[]")
-
-    @property
-    def port(self) -> int:
-        """TCP port."""
-        return int(self.listen.rpartition(":")[2])
-
     @model_validator(mode="after")
-    def _check_address(self) -> Self:
-        if not 0 < self.port < 65536:
+    def _require_port(self) -> Self:
+        if not self.address.port:
             raise ValueError("port: must be 1 to 65535")
-        self.host.encode("idna")  # the resolver encodes the name this way and would fail later
         return self
