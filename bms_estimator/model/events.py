@@ -184,9 +184,10 @@ def _fit_events(previous: Health, health: Health) -> Iterator[EventText]:
 
 def fit_event(change: FitReport) -> EventText:
     """Return the event of a fit of the pack's model that changed SOC or capacity."""
+    before, after = (f"{100.0 * each:.1f}" for each in (change.soc_before, change.soc_after))
+    soc = "" if before == after else f"the SOC from {before} to {after} % and "
     text = (
-        f"the fit to the pack's history changed the SOC from {100.0 * change.soc_before:.1f} to "
-        f"{100.0 * change.soc_after:.1f} % and the capacity from {change.capacity_before_ah:.4g} to "
+        f"the fit to the pack's history changed {soc}the capacity from {change.capacity_before_ah:.4g} to "
         f"{change.capacity_after_ah:.4g} Ah"
     )
     return EventText("pack_fitted", text, fit=change)
@@ -198,10 +199,9 @@ def _anchor_text(anchor: AnchorReport) -> str:
         cause = "the charger ended at the full voltage"
     else:
         cause = "the discharge ended at the cut-off voltage"
-    before = f"SOC {100.0 * anchor.soc_before:.1f} % (std {100.0 * anchor.soc_std_before:.1f} %)"
-    if anchor.soc_after == anchor.soc_before:
-        return f"{cause}: {before}, unchanged"
-    return f"{cause}: {before} corrected to {100.0 * anchor.soc_after:.1f} %"
+    soc, std, after = (f"{100.0 * each:.1f} %" for each in (anchor.soc_before, anchor.soc_std_before, anchor.soc_after))
+    result = "unchanged" if soc == after else f"corrected to {after}"
+    return f"{cause}: SOC {soc} (std {std}), {result}"
 
 
 def _checkpoint_events(previous: str, health: Health) -> Iterator[EventText]:

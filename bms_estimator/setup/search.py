@@ -208,7 +208,7 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
 async def _search_bluetooth(result: SearchResult) -> None:
     """Find BMS by their Bluetooth advertisements, if the optional package is installed."""
     if importlib.util.find_spec("aiobmsble") is None:
-        result.failures.append("Bluetooth: not searched: pip install 'bms_estimator[ble]'")
+        result.failures.append("Bluetooth: not searched: pip install 'bms_estimator[ble]' (Python 3.12 or later)")
         return
     from bms_estimator.sources.bluetooth.client import discover  # noqa: PLC0415 - needs an optional package
 

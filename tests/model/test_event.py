@@ -107,7 +107,7 @@ def with_counters(anchor: AnchorReport | None = None, **counters: int) -> Snapsh
 
 def test_an_anchor_causes_an_event_with_the_soc_before_and_after_it():
     full = AnchorReport(kind="full", soc_before=0.932, soc_std_before=0.021, soc_after=0.991)
-    empty = AnchorReport(kind="empty", soc_before=0.0, soc_std_before=0.02, soc_after=0.0)
+    empty = AnchorReport(kind="empty", soc_before=0.0004, soc_std_before=0.02, soc_after=0.0)
     states = [
         with_counters(full, full_anchors=1),
         with_counters(full, full_anchors=2),
@@ -116,7 +116,7 @@ def test_an_anchor_causes_an_event_with_the_soc_before_and_after_it():
     ]
     events_of_changes = [events(*pair) for pair in itertools.pairwise(states)]
     assert [[(event.name, event.text, event.anchor) for event in changes] for changes in events_of_changes] == [
-        [("full", "the charger ended at the full voltage: SOC 93.2 % (std 2.1 %) corrected to 99.1 %", full)],
+        [("full", "the charger ended at the full voltage: SOC 93.2 % (std 2.1 %), corrected to 99.1 %", full)],
         [],
         [("empty", "the discharge ended at the cut-off voltage: SOC 0.0 % (std 2.0 %), unchanged", empty)],
     ]
