@@ -73,8 +73,8 @@ def test_requests_cover_every_register_once_within_the_maximum_length(registers:
         is_near = (
             following.table == request.table and following.address <= request.address + request.words + MAX_GAP_WORDS
         )
-        # Near requests remain separate only if a value of two words would exceed the maximum length.
-        assert not is_near or following.address + 2 - request.address > MAX_WORDS - 1
+        # Near requests remain separate only if the next value, which has at most two words, would exceed the maximum length.
+        assert not is_near or following.address + 2 - request.address > MAX_WORDS
 
 
 def test_device_with_a_profile_is_read_in_as_few_requests_as_possible() -> None:
