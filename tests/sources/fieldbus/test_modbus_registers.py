@@ -53,7 +53,11 @@ def test_value_of_each_type_and_word_order_is_decoded(
     assert decode(register, words_read) == round(raw * 0.01 - 2.0, 5)
 
 
-@given(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(STRUCT_FORMATS)), st.booleans()), max_size=60))
+# few distant registers, or a dense range, in which a request reaches the maximum length
+@given(
+    st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(STRUCT_FORMATS)), st.booleans()), max_size=60)
+    | st.lists(st.tuples(st.integers(0, 200), st.sampled_from(list(STRUCT_FORMATS)), st.booleans()), min_size=60)
+)
 def test_requests_cover_every_register_once_within_the_maximum_length(registers: list[tuple[int, str, bool]]) -> None:
     values = [
         RegisterQuantity(
