@@ -48,7 +48,7 @@ def read_arrays(path: Path, max_bytes: int) -> dict[str, NDArray[Any]]:
 
 
 def to_bytes(arrays: Mapping[str, Any]) -> bytes:
-    """Encode arrays and scalars by name."""
+    """Return the bytes of a compressed ``.npz`` file with arrays and scalars by name."""
     packed = io.BytesIO()
     np.savez_compressed(packed, **arrays)
     return packed.getvalue()
@@ -85,7 +85,9 @@ class ArraysFile:
     def __init__(self, folder: Path, settings: Settings, cell: PackModel, suffix: str) -> None:
         self._suffix = suffix
         self._name, self._identity = settings.pack.name, pack_identity(settings, cell)
-        self._is_later = False  # the file has a later format
+        self._is_later = (
+            False  # the file has a later format; it gets another name, because the later version can read it
+        )
         self.path = folder / f"{self._name}-{self._identity[:8]}{suffix}"
 
     def save(self, arrays: Mapping[str, NDArray[Any]]) -> None:

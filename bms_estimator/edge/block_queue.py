@@ -1,6 +1,7 @@
 """Queue on disk with the blocks of one pack or many. A block stays until a worker has confirmed it, and is sent again on request.
 
-A *store* is the series of the numbered blocks of one pack since a creation time, which identifies it in blocks and requests.
+A *store* is a series of numbered blocks of one pack. Blocks and requests identify it by its creation time. A new store begins if
+the disk has lost blocks that a worker already has.
 
 The event loop never waits for the disk. Blocks wait in memory without a number until they are written. A block is sent
 only after its number is on disk, since a restart could otherwise use the number again.
@@ -44,7 +45,7 @@ log = structlog.get_logger(__name__)
 
 @dataclass
 class _Pack:
-    """Blocks of a pack on disk."""
+    """Position of a pack on disk, and progress of sending its blocks."""
 
     position: PackPosition
     cursor: int = 1
@@ -87,7 +88,7 @@ class BlockQueue:
         self._packs = dict[str, _Pack]()
         self._unwritten = list[tuple[str, ReadyBlock]]()  # blocks that are not on disk yet
         self._unsent = dict[str, None]()  # packs with blocks on disk from their cursor on, in the order of sending
-        self._repeats = list[BlockRange]()  # single blocks to send again
+        self._single_resends = list[BlockRange]()  # of one block each
         self._in_flight = dict[int, tuple[str, int]]()  # pack and number of sent blocks, by number of the message
         self._messages = itertools.count(1)
         self._changed, self._removed = set[str](), set[str]()  # packs whose row on disk differs from memory
@@ -129,7 +130,7 @@ class BlockQueue:
         return len(self._unwritten) + ready + len(self._in_flight)
 
     def add_pack(self, pack: str, position: PackPosition) -> None:
-        """Set the position of a pack that is not stored."""
+        """Add a pack, or replace its position, in memory only."""
         self._forget_sent(pack)
         self._packs[pack] = _Pack(position, max(position.sent + 1, position.oldest))
         self._update_unsent(pack)
@@ -160,25 +161,25 @@ class BlockQueue:
             self._changed.add(pack)
             self._loss_logged = False  # the server receives blocks
             if request.resend and request.number < entry.cursor:
-                self._resend(entry, request.number)
+                self._resend_from(entry, request.number)
             self._update_unsent(pack)
 
-    def repeat(self, pack: str, number: int) -> None:
-        """Send one block again, if it was sent and is still stored."""
+    def resend_one(self, pack: str, number: int) -> None:
+        """Send one block again, without those after it, if it was sent and is still stored."""
         position = self.position(pack)
         if position.oldest <= number < self._packs[pack].cursor:
-            self._repeats.append(BlockRange(pack, position.created_s, number, number + 1))
+            self._single_resends.append(BlockRange(pack, position.created_s, number, number + 1))
             self._block_ready.set()
 
     async def take(self, max_count: int) -> list[QueuedMessage]:
         """Wait for a block, then return up to ``max_count`` blocks, consecutive ones of each pack."""
         while True:
-            while not (self._unsent or self._repeats):
+            while not (self._unsent or self._single_resends):
                 self._block_ready.clear()
                 await self._block_ready.wait()
-            repeats, self._repeats = self._repeats[:max_count], self._repeats[max_count:]
+            resends, self._single_resends = self._single_resends[:max_count], self._single_resends[max_count:]
             unsent = ((pack, self._packs[pack]) for pack in itertools.islice(self._unsent, max_count))
-            ranges = repeats + [
+            ranges = resends + [
                 BlockRange(pack, entry.position.created_s, entry.cursor, entry.position.next_number)
                 for pack, entry in unsent
             ]
@@ -281,10 +282,10 @@ class BlockQueue:
             entry.cursor = end
             self._unsent.pop(pack, None)  # the other packs are next
             self._update_unsent(pack)
-        elif end - first > 1:  # a page of one block may be a repeat, which lies before the cursor
+        elif end - first > 1:  # a page of one block may be of ``resend_one``, and lie before the cursor
             return
         if page.is_damaged:
-            self._changed.add(pack)
+            self._changed.add(pack)  # the next write finds the oldest block that is left
         oldest = max(page.oldest, entry.position.oldest)
         for number, data in page.blocks.items():
             message = next(self._messages)
@@ -292,8 +293,11 @@ class BlockQueue:
             payload = with_oldest(data, min(oldest, number))
             yield QueuedMessage(message, Message(self._topic(pack), payload, 1, retain=False))
 
-    def _resend(self, entry: _Pack, number: int) -> None:
-        """Send a block and all later blocks again, unless the block was resent less than ``resend_s`` ago."""
+    def _resend_from(self, entry: _Pack, number: int) -> None:
+        """Send the requested block and all later blocks again, unless that request was granted less than ``resend_s`` ago.
+
+        The requested block is the oldest one, because ``on_request`` has confirmed the blocks before it, unless it was dropped.
+        """
         now_s = asyncio.get_running_loop().time()
         last_number, last_s = entry.last_resend
         if number != last_number or now_s - last_s >= self._resend_s:
@@ -307,13 +311,14 @@ class BlockQueue:
         The disk may have been restored from a backup.
         """
         position, first_s = self.position(pack), math.ceil(other_ns / NS_PER_S) + 1
+        # begun by an earlier request; the creation time is set with the first block
         is_begun = not position.created_s and position.last_s >= first_s
         if first_s > MAX_CREATED_S or is_begun:
             return
         log.warning("a worker has later blocks of this pack than this store: a new store is begun", pack=pack)
         self._count_lost(position.next_number - position.oldest, "a new store is begun")
         self.add_pack(pack, PackPosition(last_s=max(position.last_s, first_s)))
-        self._removed.add(pack)
+        self._removed.add(pack)  # ``write_changes`` deletes the old blocks before it writes the new position
         self._changed.add(pack)
 
     def _forget_sent(self, pack: str) -> None:

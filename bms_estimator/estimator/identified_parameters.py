@@ -1,4 +1,9 @@
-"""Identified parameters in the estimator's records, with their standard deviations."""
+"""Identified parameters in the estimator's records, with their standard deviations.
+
+Two fits contribute: the fit of each element to the identifier's map over SOC (``record["fit"]``), and the slow fit to weeks of
+history, which replaces the curves of the cell file in ``settings["filter"]``. A resistance is the sum of two curves over SOC at
+25 C: ``weak_ohm`` depends weakly on the temperature, ``strong_ohm`` strongly.
+"""
 
 import math
 from functools import lru_cache
@@ -57,7 +62,7 @@ def present_elements(record: np.void) -> dict[str, IdentifiedValue]:
 
 
 def fitted_parameter(record: np.void, index: int) -> IdentifiedValue | None:
-    """Return a_i of the fit over SOC; None if its element was observed in fewer than ``MIN_BINS`` SOC bins.
+    """Return a_i of the fit to the map over SOC; None if its element was observed in fewer than ``MIN_BINS`` SOC bins.
 
     Args:
         record: Record of dtype ESTIMATOR_STATE.
@@ -154,7 +159,7 @@ def ocv_correction_with_std(record: np.void, settings: np.void, soc: Floats) -> 
 
 @lru_cache(maxsize=64)
 def _node_weights(settings: bytes, socs: bytes) -> tuple[Floats, Floats]:
-    """Return the weight of each node of the correction, and the std of the varying error of the curve, at each SOC [V].
+    """Return the weight of each node of the correction, and the std of the error that no node covers, at each SOC [V].
 
     Args:
         settings: Bytes of a record of EKF_SETTINGS, a hashable argument for the cache.
@@ -181,6 +186,7 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
     record, settings = estimator.record[0], estimator.settings_record[0]
     capacity = relative_capacity(record)
     ln_r0, ln_r, r_std = _resistance_scales(estimator)
+    # the elements of a cell file have one factor for all SOCs: R_0 by its own, each RC pair by the usual one of R_1..R_6
     fitted = fitted_resistance_factors(estimator, np.array([0.5]))[0]
     r0_factor, pair_factor = math.exp(ln_r0) * fitted[0], math.exp(ln_r) * float(np.median(fitted[1:]))
     values = cell.model_dump()
@@ -196,6 +202,7 @@ def identified_cell(estimator: Estimator, cell: CellModel, series: int) -> CellM
         for name in ("weak_ohm", "strong_ohm"):
             values["ladder"][name] = (factors * np.array(values["ladder"][name])).tolist()
         values["ladder"]["std"] = r_std
+    # false for a curve with a plateau before a slow fit: its nodes then have one common error, and the curve keeps its shape
     if settings["filter"]["node_correlation"] <= NODE_CORRELATION:
         values["ocv"] = _corrected_ocv(estimator, cell, series)
     return CellModel.model_validate(values)

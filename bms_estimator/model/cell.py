@@ -101,7 +101,7 @@ class CellModel(Strict):
     # repr=False: identities of checkpoints are hashes of the repr, and do not depend on the origin of the values
     fit: Fit | None = Field(default=None, repr=False, description="captures that the values were fitted to")
     no_forecast_reason: ClassVar[str] = "the identifier is switched off"
-    """Reason why the estimator of this model makes no forecasts, if it makes none."""
+    """Reason to report if the estimator of this model makes no forecasts."""
     always_learns: ClassVar[bool] = False
     """False: the observer uses the configured law."""
     min_voltage_ratio: ClassVar[float] = 0.6
@@ -116,11 +116,11 @@ class CellModel(Strict):
         return self
 
     def by_kind(self, battery: Callable[["CellModel"], Result], _stack: object) -> Result:
-        """Return the result of the first function, that of a battery, for this model."""
+        """Return ``battery(self)``. The model of a fuel cell calls the second function instead."""
         return battery(self)
 
     def battery(self, _error: str) -> "CellModel":
-        """Return this model, which is that of a battery."""
+        """Return this model. The model of a fuel cell raises a UserError with the text ``_error`` instead."""
         return self
 
     @property

@@ -100,7 +100,7 @@ class FuelCellModel(Strict):
     """Minimum voltage relative to the nominal voltage. A stack without gas has 0 V."""
 
     def by_kind(self, _battery: object, stack: Callable[["FuelCellModel"], Result]) -> Result:
-        """Return the result of the second function, that of a stack, for this model."""
+        """Return ``stack(self)``. The model of a battery calls the first function instead."""
         return stack(self)
 
     def battery(self, error: str) -> NoReturn:

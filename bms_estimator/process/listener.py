@@ -94,7 +94,7 @@ class Connections:
 
     def add(self, client_socket: socket.socket, transport: asyncio.Transport, address: str) -> None:
         """Add a connection and start the deadline of its first request; close it if the limits do not allow it."""
-        if not self._make_room(address):
+        if not self._allow_one_more(address):
             transport.abort()
             return
         deadline = asyncio.get_running_loop().call_later(HEADER_TIMEOUT_S, transport.abort)
@@ -123,12 +123,13 @@ class Connections:
     def _expire(self, connection: _Connection) -> None:
         """Close a connection, unless its client has read a part of the response since the deadline was set."""
         unsent = connection.transport.get_write_buffer_size()
+        # a response that was begun after the deadline was set had no unsent bytes then
         if unsent and (not connection.unsent or unsent < connection.unsent):
             self._start_deadline(connection)
         else:
             connection.transport.abort()
 
-    def _make_room(self, address: str) -> bool:
+    def _allow_one_more(self, address: str) -> bool:
         """Return True if an address may have one more connection; close an idle one if necessary."""
         self._prune()
         own = [each for each in self._by_transport.values() if each.address == address]
@@ -160,7 +161,7 @@ CONNECTIONS = Connections()
 
 
 class Listener:
-    """Accepts connections on one address.
+    """Listener that accepts connections on one address.
 
     Args:
         protocol: Protocol factory, such as aiohttp's ``web.Server``.
@@ -173,7 +174,7 @@ class Listener:
         self._protocol, self._connections = protocol, connections
         self._sockets: list[socket.socket] = []
         self._connecting: set[asyncio.Task[None]] = set()
-        self._resuming: dict[socket.socket, asyncio.TimerHandle] = {}
+        self._resuming: dict[socket.socket, asyncio.TimerHandle] = {}  # end of the pause of each paused socket
         self._opening: asyncio.Task[None] | None = None
         self._log_time_s = -LOG_INTERVAL_S
 

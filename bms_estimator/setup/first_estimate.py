@@ -82,7 +82,7 @@ def estimate_text(estimate: Estimate) -> str:
     return f"SOC {estimate.soc:.1%}{band}, {values}"
 
 
-def load_note(current_a: float, capacity_ah: float) -> str:
+def current_note(current_a: float, capacity_ah: float) -> str:
     """Return a note about the first estimate under a large current; empty if the current is small.
 
     Args:

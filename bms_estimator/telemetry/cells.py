@@ -19,15 +19,15 @@ class WeakestCell(NamedTuple):
     """Estimate of the weakest cell."""
 
     number: int | None
-    """Number of the cell, from 1; None if the bank's voltage does not tell which cell it is."""
+    """Number of the cell, from 1; None if only the voltage of the bank, all cells in series, is measured."""
     soc: float
     """SOC, 0..1."""
     std: float
     """Std of ``soc``."""
     capacity_ratio: float
     """Capacity relative to the other cells."""
-    by: CellDeviations | ComparedCell
-    """Estimate from the cell voltages, or from the bank's voltage, of which this is the result."""
+    source: CellDeviations | ComparedCell
+    """Estimate that these values come from: all cells by their voltages, or one cell by the voltage of its bank."""
 
 
 def weakest_by_cells(cells: CellDeviations) -> WeakestCell:
@@ -168,8 +168,11 @@ def make_cells_payload(cells: CellDeviations, short_limit_a: float, now_s: float
 
 
 def weakest_cell_fields(cell: WeakestCell) -> dict[str, float | int | None]:
-    """Return the weakest cell and the spreads of the cells as fields of ``Estimate``; the spreads only by cell voltages."""
-    cells = cell.by
+    """Return the weakest cell and the spreads of the cells as fields of ``Estimate``.
+
+    Without cell voltages the spreads are None.
+    """
+    cells = cell.source
     return {
         "weakest_cell": cell.number,
         "weakest_cell_soc": finite(cell.soc),

@@ -77,8 +77,8 @@ CONFIGURED_REASON = "from the cell file: no data has identified it"
 MOVED_REASON = "moved by the adaptive law of the thesis, which does not identify it"
 """Reason why a value that a law of the thesis has changed is not valid."""
 MOVED_RATIO = 1e-6
-"""Minimum relative difference from the cell file of a value that a law of the thesis has changed. (3.18) changes a value near
-its limit by less."""
+"""Relative difference from the cell file above which a law of the thesis counts as having changed a value. Near its limit (3.18)
+changes a value by less."""
 LEARNED_REASON = "learned by the adaptive law, which gives no std"
 """Reason why a value of the learning law is not valid."""
 CAPACITANCE_PARAMETERS = range(7, 13)
@@ -137,12 +137,12 @@ def _battery_report(estimator: Estimator, cell: CellModel, now_s: float) -> Para
     from_data = _is_data_driven(estimator)
     unlearned_reason = _unlearned_reason(estimator)
     for i in range(1, 16):
-        observer_value = _with_reason(parameters[f"a{i}"], unlearned_reason[i])
-        observer_value = parameters[f"a{i}"] = _mark_source(observer_value, from_data[i], learning)
+        parameter = _mark_source(_with_reason(parameters[f"a{i}"], unlearned_reason[i]), from_data[i], learning)
         if estimator.has_filter and not learning:
-            parameters[f"a{i}"] = _with_fit_std(observer_value, fitted_parameter(record, i), now_s)
+            parameter = _with_fit_std(parameter, fitted_parameter(record, i), now_s)
             if i in CAPACITANCE_PARAMETERS:
-                parameters[f"a{i}"] = _with_tau_validity(parameters[f"a{i}"], estimator)
+                parameter = _with_tau_validity(parameter, estimator)
+        parameters[f"a{i}"] = parameter
     for e, name in enumerate(ELEMENT_NAMES):  # each element has three parameters, from a1 on
         indices = slice(3 * e + 1, 3 * e + 4)
         reason = next((each for each in unlearned_reason[indices] if each != CONFIGURED_REASON), CONFIGURED_REASON)
@@ -151,7 +151,7 @@ def _battery_report(estimator: Estimator, cell: CellModel, now_s: float) -> Para
         for name, identified in present_elements(record).items():
             elements[name] = _select_parameter(identified, elements[name], VALID_STD, now_s)
         health = _state_of_health(estimator, now_s)
-    if estimator.settings_record["series_resistance"][0]:
+    if estimator.settings_record["series_resistance"][0]:  # R_s comes from (4.2)
         fitted = series_resistance_parameters(estimator)
         elements["r_s_ohm"] = fitted.pop("r_s_ohm")
         parameters |= fitted
@@ -208,7 +208,7 @@ def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
 
     A capacitance that is not positive is null. C_ts is not positive up to the SOC delta1, C_tl up to delta2.
     """
-    state, ocv = estimator.state[0], estimator.settings[0]
+    state, settings = estimator.state[0], estimator.settings[0]
     soc = float(state["soc"])
     limits = {"c_ts_farad": "delta_1", "c_tl_farad": "delta_2"}
     elements = {}
@@ -216,7 +216,7 @@ def _elements_of(estimator: Estimator, a: np.ndarray) -> dict[str, Parameter]:
         value, limit = function(soc, a), limits.get(name, "")
         why_missing = f"SOC {soc:.4f} is not above {limit} = {state[limit]:.4f}" if limit else ""
         elements[name] = _configured_parameter(value if value > 0.0 else math.nan, why_missing)
-    elements["e_o_v"] = _configured_parameter(chen_mora.ocv(soc, ocv["ocv_v"], ocv["ocv_slope_v"]), "")
+    elements["e_o_v"] = _configured_parameter(chen_mora.ocv(soc, settings["ocv_v"], settings["ocv_slope_v"]), "")
     return elements
 
 
@@ -225,12 +225,12 @@ def _state_of_health(estimator: Estimator, now_s: float) -> dict[str, Parameter]
     record, settings = estimator.record[0], estimator.settings_record[0]
     ratio, p = relative_series_resistance(record, settings, estimator.cell_file_settings), settings["filter"]
     capacity, offset_a = relative_capacity(record), current_offset(record)
-    first_std_a = float(p["offset_c"] * p["capacity_as"]) / 3600.0
+    initial_std_a = float(p["offset_c"] * p["capacity_as"]) / 3600.0
     return {
         "capacity": _bias_parameter(capacity, VALID_CAPACITY_STD, "identifier.capacity_std", now_s),
         "r_s": _select_parameter(ratio, _configured_parameter(1.0, ""), VALID_STD, now_s),
         "current_offset_a": _bias_parameter(
-            offset_a, VALID_OFFSET_FRACTION * first_std_a, "identifier.current_offset_std_a", now_s
+            offset_a, VALID_OFFSET_FRACTION * initial_std_a, "identifier.current_offset_std_a", now_s
         ),
     }
 

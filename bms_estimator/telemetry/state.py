@@ -82,16 +82,16 @@ def missing_margin_reason(row: np.void, *, soc_known: bool) -> str | None:
         row: Estimate, dtype TRACE.
         soc_known: True if its SOC is known.
     """
-    if math.isnan(row["soc"]):
+    if math.isnan(row["soc"]):  # a fuel cell
         return None
     if math.isnan(row["stability_margin"]):
         return NOT_IDENTIFIED if max(row["delta_1"], row["delta_2"]) > 0.0 else ALWAYS_STABLE
     return None if soc_known else UNKNOWN_SOC
 
 
-NAMES = FORECAST.names or ()
+FORECAST_FIELDS = FORECAST.names or ()
 """Fields of ``Estimate`` that a forecast supplies."""
-DURATIONS = tuple(name for name in NAMES if name.startswith("time_to_"))
+DURATIONS = tuple(name for name in FORECAST_FIELDS if name.startswith("time_to_"))
 """Fields that are durations, which decrease between two forecasts [s]."""
 CURVES = ("soc_p05", "soc_p50", "soc_p95", "voltage_p05_v", "voltage_p50_v", "voltage_p95_v", "survival")
 """Fields of ``ForecastCurve`` and ``ForecastReport``."""
@@ -110,7 +110,7 @@ def forecast_fields(forecast: Forecast, time_s: float) -> dict[str, Any]:
         time_s: Time stamp of the published sample [s].
     """
     elapsed_s = max(time_s - forecast.time_s, 0.0)
-    values = dict(zip(NAMES, forecast.values[0].item(), strict=True))
+    values = dict(zip(FORECAST_FIELDS, forecast.values[0].item(), strict=True))
     values |= {name: max(values[name] - elapsed_s, 0.0) for name in DURATIONS if math.isfinite(values[name])}
     known = {name: value if math.isfinite(value) else None for name, value in values.items()}
     return known | {"forecast_reason": forecast.reason}
@@ -126,7 +126,7 @@ def make_forecast_payload(forecast: Forecast, cutoff_v: float, window: WindowSum
         now_s: Wall clock [s since 1970].
     """
     curve = forecast.curve
-    age_s = max(float(window.last["time_s"]) - forecast.time_s, 0.0)
+    age_s = max(float(window.last["time_s"]) - forecast.time_s, 0.0)  # NaN before the first forecast
     return ForecastReport(
         time=iso_utc(max(window.arrival_s - age_s, 0.0) if math.isfinite(age_s) else window.arrival_s),
         publish_time=iso_utc(now_s),

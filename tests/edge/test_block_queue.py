@@ -208,7 +208,7 @@ async def test_resend_of_a_pack_does_not_delay_the_others(tmp_path: Path) -> Non
         await write_blocks(queue, *minute_blocks(1, first=4), pack="b")
         assert numbers(await take(queue, 1, "a")) == [2]
         assert numbers(await take(queue, 1, "b")) == [5]
-        queue.repeat("b", 3)
+        queue.resend_one("b", 3)
         assert numbers(await take(queue, 1, "b")) == [3]
         assert numbers(await take(queue, 2, "a")) == [3, 4]
 

@@ -84,15 +84,15 @@ def test_devices_topics_and_bytes_are_bounded_and_stored_devices_are_updated() -
 
 
 def test_new_device_replaces_the_device_that_has_been_silent_longest() -> None:
-    not_shown = list[str]()  # rejected or replaced devices
-    cache = TopicCache("bms", not_shown.append)
+    hidden = list[str]()  # rejected or replaced devices, in this order
+    cache = TopicCache("bms", hidden.append)
     for number in range(MAX_DEVICES):
         cache.add_message(f"bms/d{number}/state", b"1", NOW + number)
     cache.add_message("bms/d0/state", b"1", NOW + MAX_DEVICES)  # d1, last received at NOW + 1 s, is now silent longest
     assert cache.add_message("bms/new/state", b"1", NOW + SILENT_S) is None
-    assert not_shown == ["new"]
+    assert hidden == ["new"]
     assert cache.add_message("bms/new/state", b"1", NOW + SILENT_S + MAX_DEVICES) == DeviceMessage("new", "state", 1)
-    assert not_shown == ["new", "d1"]
+    assert hidden == ["new", "d1"]
     assert cache.hidden == 1
     assert {"new", "d0"} <= cache.devices.keys()
 

@@ -7,7 +7,7 @@ import pytest
 from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import Settings
 from bms_estimator.setup import measurement
-from bms_estimator.setup.first_estimate import load_note
+from bms_estimator.setup.first_estimate import current_note
 from tests.scripted_source import ScriptedSource
 
 
@@ -33,4 +33,4 @@ async def test_a_device_without_valid_values_is_an_error(source) -> None:
 
 @pytest.mark.parametrize(("current_a", "is_noted"), [(10.0, False), (10.5, True), (-10.5, True)])
 def test_a_current_above_a_tenth_of_the_capacity_is_noted(current_a: float, is_noted: bool) -> None:
-    assert bool(load_note(current_a, 100.0)) is is_noted
+    assert bool(current_note(current_a, 100.0)) is is_noted

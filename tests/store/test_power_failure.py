@@ -39,7 +39,7 @@ asyncio.run(main(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])))
 CALL = re.compile(
     r'(\w+)\((?:AT_FDCWD, )?(?:\d+<([^>]+)>|"([^"]+)")(?:, "([^"]*)")?(?:, (\d+))?(?:, (\d+))?[^)]*\) += \d'
 )
-"""Line of a traced call: name, path by descriptor or as text in hexadecimal, data in hexadecimal, and numbers."""
+"""Line of a traced call: name; path, either after the descriptor or as an argument; data; numbers. Paths and data are hexadecimal."""
 WRITES = "pwrite64", "ftruncate", "unlink"
 
 Event = tuple[str, str, bytes, int]
@@ -54,7 +54,7 @@ def traced_calls(strace: str, folder: Path, sync_s: float) -> list[Event]:
     subprocess.run(command, check=True, timeout=LONG_S)
     events = list[Event]()
     for line in log.read_text().splitlines():
-        assert "unfinished" not in line or "pack.sqlite" not in line
+        assert "unfinished" not in line or "pack.sqlite" not in line, "a call of another thread has split this line"
         if call := CALL.search(line):
             name, descriptor, text, data, *numbers = call.groups()
             path = Path(bytes.fromhex((descriptor or text).replace("\\x", "")).decode())
@@ -65,7 +65,9 @@ def traced_calls(strace: str, folder: Path, sync_s: float) -> list[Event]:
 
 
 class Disk:
-    """Disk on which a write is certain to survive a power failure after the fsync of its file, or of the folder for names."""
+    """Disk on which a write is certain to survive a power failure only after an fsync: a write to a file after the fsync of the file,
+    the removal of a file after the fsync of the folder.
+    """
 
     def __init__(self, folder: str) -> None:
         self._folder, self._synced, self._pending = folder, dict[str, bytes](), list[Event]()

@@ -103,6 +103,31 @@ raising contains the delay of the alarm.
 """
 
 
+def make_evaluator(alarms: dict[str, Any] | None = None, cell: CellModel = PACK) -> AlarmEvaluator:
+    """Return an evaluator for a pack with these settings of the alarms. A silence of 10 s raises link_lost."""
+    return AlarmEvaluator(settings(alarms), Estimator(cell))
+
+
+def add_samples(
+    alarms: AlarmEvaluator,
+    *times_s: float,
+    temperature_c: float = NAN,
+    voltage_v: float = 7.4,
+    current_a: float = 0.0,
+    cells_v: tuple[float, ...] = (),
+    probes_c: tuple[float, ...] = (),
+    status: int = 0,
+) -> None:
+    """Evaluate samples of a pack."""
+    block = np.zeros(len(times_s), dtype=SAMPLE)
+    block["time_s"], block["voltage_v"], block["temperature_c"] = times_s, voltage_v, temperature_c
+    block["temperature_min_c"] = block["temperature_max_c"] = temperature_c
+    block["current_a"], block["status"] = current_a, status
+    cells = np.tile(cells_v, (len(times_s), 1)) if cells_v else NO_CELLS
+    probes = probe_block([[(reading_c, False) for reading_c in probes_c]] * len(times_s))
+    alarms.evaluate(block, NO_TRACE, cells, WALL_S, probes=probes)
+
+
 async def test_one_hot_probe_of_four_raises_the_alarm_and_is_named(tmp_path: Path) -> None:
     rise = [Line(1, temperatures_c=(25.0, 25.0 + 8.0 * n, 25.0, 25.0)) for n in range(10)]
     lines = [
@@ -141,8 +166,8 @@ async def test_the_coldest_probe_raises_the_freezing_alarm(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(("temperature_c", "name"), [(70.0, "over_temperature"), (-25.0, "under_temperature")])
-def test_samples_with_only_a_mean_temperature_are_judged_by_it(temperature_c: float, name: str) -> None:
-    samples = np.zeros(100, dtype=SAMPLE)  # extremes of 0 degC, which do not enclose the mean
+def test_a_mean_temperature_without_extremes_raises_an_alarm(temperature_c: float, name: str) -> None:
+    samples = np.zeros(100, dtype=SAMPLE)  # lowest and highest temperature stay 0 degC: they are not measured
     samples["time_s"], samples["voltage_v"], samples["temperature_c"] = np.arange(100.0), 7.4, temperature_c
     alarms = make_evaluator()
     alarms.evaluate(samples, NO_TRACE, NO_CELLS, WALL_S)
@@ -152,7 +177,7 @@ def test_samples_with_only_a_mean_temperature_are_judged_by_it(temperature_c: fl
 def test_each_alarm_has_a_capture() -> None:
     unrecorded = {"hook_failed", "alarm_state_lost", "weak_cell", "stability_margin_low", *COMPARISONS}
     assert set(CAPTURES) == set(ALARMS) - unrecorded, (
-        "no capture has hooks, earlier runs, several discharges, hours or three cells"
+        "the alarms without a capture need hooks, earlier runs, several discharges, hours or three cells"
     )
 
 
@@ -228,7 +253,7 @@ def knee(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.thorough
-async def test_collapse_risk_says_probability_and_time_left_and_does_not_depend_on_the_size_of_blocks(
+async def test_collapse_risk_contains_probability_and_time_left_and_does_not_depend_on_the_size_of_blocks(
     knee: Path,
 ) -> None:
     result = await replayed(knee, settings(pack={}), at_once=True)
@@ -271,28 +296,28 @@ class KernelAlarm:
     """
 
     def __init__(self, sign: float = 1.0, **changes: float) -> None:
-        self._alarms, self._part, self._log = np.zeros(1, STATES), np.zeros(1, EVALUATION_IO), np.zeros(9, LOG)
+        self._alarms, self._io, self._log = np.zeros(1, STATES), np.zeros(1, EVALUATION_IO), np.zeros(9, LOG)
         self._limits, self._sign, self._time_s = np.zeros(1, LIMITS), sign, 0.0
         rule = {"limit": 10.0, "clear": 8.0, "delay_s": 2.0, "clear_delay_s": 3.0, "latch": 0} | changes
         for name, value in {"monitored": 1, "sign": sign, **rule}.items():
             self._limits[name] = sign * value if name in ("limit", "clear") else value
 
-    def take(self, *values: float) -> list[tuple[float, bool]]:
-        """Process values at intervals of 1 s, the first of all at 0 s. Return the times of raising (True) and ending."""
+    def process(self, *values: float) -> list[tuple[float, bool]]:
+        """Process values at intervals of 1 s, from 0 s on over all calls. Return the times of raising (True) and ending."""
         for value in values:
-            tables = self._alarms, self._limits, np.zeros(1, SETTINGS), self._part, self._log
+            tables = self._alarms, self._limits, np.zeros(1, SETTINGS), self._io, self._log
             update_alarm(*tables, 0, self._time_s, 1.0, self._sign * value)
             self._time_s += 1.0
         return self._changes()
 
     def acknowledge(self) -> list[tuple[float, bool]]:
-        """Acknowledge the alarm. Return the same as ``take``."""
-        acknowledge(self._alarms, self._part, self._log, 0, self._time_s)
+        """Acknowledge the alarm. Return the times of raising (True) and ending."""
+        acknowledge(self._alarms, self._io, self._log, 0, self._time_s)
         return self._changes()
 
     def _changes(self) -> list[tuple[float, bool]]:
-        entries = self._log[: self._part["logged"][0]]
-        self._part["logged"] = 0
+        entries = self._log[: self._io["logged"][0]]
+        self._io["logged"] = 0
         return list(zip(entries["at_s"].tolist(), (entries["kind"] == RAISED).tolist(), strict=True))
 
 
@@ -312,20 +337,20 @@ class KernelAlarm:
 def test_an_alarm_is_raised_at_its_limit_and_cleared_below_its_clear_level_after_delays(
     values: list[float], transitions: list[tuple[float, bool]]
 ) -> None:
-    assert KernelAlarm().take(*values) == KernelAlarm(sign=-1.0).take(*values) == transitions
+    assert KernelAlarm().process(*values) == KernelAlarm(sign=-1.0).process(*values) == transitions
 
 
 def test_without_delay_and_hysteresis_each_crossing_is_a_transition() -> None:
     alarm = KernelAlarm(clear=10.0, delay_s=0.0, clear_delay_s=0.0)
-    assert alarm.take(9.0, 10.0, 9.9, 10.0) == [(1.0, True), (2.0, False), (3.0, True)]
+    assert alarm.process(9.0, 10.0, 9.9, 10.0) == [(1.0, True), (2.0, False), (3.0, True)]
 
 
 def test_a_latched_alarm_ends_only_after_it_was_acknowledged() -> None:
     alarm = KernelAlarm(latch=1, delay_s=0.0, clear_delay_s=0.0)
-    assert alarm.take(11.0, 7.0) == [(0.0, True)]
-    assert alarm.take(11.0) == alarm.acknowledge() == [], "the cause is there again"
-    assert alarm.take(7.0) == [(3.0, False)]
-    assert alarm.take(11.0, 7.0) == [(4.0, True)], "an earlier acknowledgment does not count"
+    assert alarm.process(11.0, 7.0) == [(0.0, True)]
+    assert alarm.process(11.0) == alarm.acknowledge() == [], "the cause is there again"
+    assert alarm.process(7.0) == [(3.0, False)]
+    assert alarm.process(11.0, 7.0) == [(4.0, True)], "an earlier acknowledgment does not count"
     assert alarm.acknowledge() == [(6.0, False)]
 
 
@@ -365,11 +390,6 @@ async def test_a_raised_alarm_survives_a_restart_and_ends_with_its_cause(tmp_pat
     assert after.snapshots[0].alarms != ()
     assert after.transitions("pack_under_voltage") == [(60.0, False)]
     assert json.loads(after.saved_state).keys() & {"pack_under_voltage"} == set()
-
-
-def make_evaluator(alarms: dict[str, Any] | None = None, cell: CellModel = PACK) -> AlarmEvaluator:
-    """Return an evaluator for a pack with these settings of the alarms. A silence of 10 s raises link_lost."""
-    return AlarmEvaluator(settings(alarms), Estimator(cell))
 
 
 def test_text_of_a_raised_reading_fault_stays_while_only_its_numbers_change() -> None:
@@ -622,26 +642,6 @@ async def test_a_lost_quantity_stays_lost_over_a_restart(tmp_path: Path) -> None
     assert after.transitions("sensor_fault") == [(10.0, True)]
 
 
-def add_samples(
-    alarms: AlarmEvaluator,
-    *times_s: float,
-    temperature_c: float = NAN,
-    voltage_v: float = 7.4,
-    current_a: float = 0.0,
-    cells_v: tuple[float, ...] = (),
-    probes_c: tuple[float, ...] = (),
-    status: int = 0,
-) -> None:
-    """Evaluate samples of a pack."""
-    block = np.zeros(len(times_s), dtype=SAMPLE)
-    block["time_s"], block["voltage_v"], block["temperature_c"] = times_s, voltage_v, temperature_c
-    block["temperature_min_c"] = block["temperature_max_c"] = temperature_c
-    block["current_a"], block["status"] = current_a, status
-    cells = np.tile(cells_v, (len(times_s), 1)) if cells_v else NO_CELLS
-    probes = probe_block([[(reading_c, False) for reading_c in probes_c]] * len(times_s))
-    alarms.evaluate(block, NO_TRACE, cells, WALL_S, probes=probes)
-
-
 def test_alarms_are_unwatched_during_silence_and_the_first_10_s_of_samples() -> None:
     alarms = make_evaluator()
     add_samples(alarms, 0.0)
@@ -745,7 +745,7 @@ async def test_times_with_jitter_neither_shorten_delays_nor_count_charge_twice(t
     result = await replayed(capture, settings(**WITHOUT_IDENTIFIER))
     (raised_s, _), (ended_s, _) = result.transitions("over_temperature")
     assert raised_s == pytest.approx(10.0, abs=MAX_LEAD_S)
-    # these are sample times, which lead the arrivals by a constant
+    # times of samples, whose lead over the arrivals is limited at both transitions
     assert ended_s == pytest.approx(hot_s + 60.0, abs=2.0 * MAX_LEAD_S)
     texts = [change.alarm.text for change in result.changes if change.alarm.name == "sensor_fault"]
     assert any("the times of the source jump again and again" in text for text in texts)
@@ -789,7 +789,7 @@ async def test_a_pack_stays_hot_while_the_hot_probe_reads_cold_sooner_than_it_ca
 
 
 @pytest.mark.parametrize("is_faulty", [False, True])
-def test_only_an_acknowledgement_with_a_faulty_probe_ends_over_temperature_with_one(is_faulty: bool) -> None:
+def test_over_temperature_with_a_faulty_probe_ends_only_if_it_was_acknowledged_after_the_fault(is_faulty: bool) -> None:
     alarms = make_evaluator()
     faulty = int(SampleStatus.PROBE_FAULT)
     add_samples(alarms, *range(20), temperature_c=70.0)
@@ -814,7 +814,7 @@ def test_an_acknowledgement_with_a_faulty_probe_does_not_cover_the_loss_of_a_sec
     assert "over_temperature" not in alarms.active
 
 
-def test_an_acknowledgement_with_a_broken_wire_does_not_cover_that_of_a_second_full_cell() -> None:
+def test_an_acknowledgement_with_a_broken_wire_does_not_cover_the_broken_wire_of_a_second_full_cell() -> None:
     alarms = make_evaluator({"cell_over_voltage": {"latch": False}})
     add_samples(alarms, *range(20), cells_v=(4.3, 4.2))
     add_samples(alarms, *range(20, 30), cells_v=(0.3, 4.2))

@@ -8,7 +8,13 @@ from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import ForecastReport
 from bms_estimator.telemetry.publish_window import Window, WindowSummary
-from bms_estimator.telemetry.state import NAMES, cutoff_text, forecast_fields, make_forecast_payload, no_forecast
+from bms_estimator.telemetry.state import (
+    FORECAST_FIELDS,
+    cutoff_text,
+    forecast_fields,
+    make_forecast_payload,
+    no_forecast,
+)
 from tests.sinks.snapshots import CUTOFF_V, NOW, forecast_at
 
 FORECAST = forecast_at(600.0)
@@ -25,7 +31,7 @@ def window_at(time_s: float) -> WindowSummary:
 
 
 def test_every_value_of_a_forecast_is_a_field_of_the_state() -> None:
-    assert set(NAMES) < set(Estimate.model_fields)
+    assert set(FORECAST_FIELDS) < set(Estimate.model_fields)
 
 
 def test_durations_decrease_between_two_forecasts_and_probabilities_do_not() -> None:
@@ -42,7 +48,7 @@ def test_durations_do_not_grow_if_the_clock_of_the_samples_is_set_back() -> None
 
 def test_unknown_values_are_null_and_the_reason_is_published() -> None:
     fields = forecast_fields(no_forecast("the pack is charged"), 5.0)
-    assert fields == dict.fromkeys(NAMES) | {"forecast_reason": "the pack is charged"}
+    assert fields == dict.fromkeys(FORECAST_FIELDS) | {"forecast_reason": "the pack is charged"}
     assert forecast_fields(FORECAST, 5.0)["available_charge_power_10s_w"] is None
 
 

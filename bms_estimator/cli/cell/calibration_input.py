@@ -76,7 +76,7 @@ def given_cell(pack: Path | None, cell: str | None, capacity_ah: float | None, s
 def load_captures_and_curves(
     paths: Sequence[Path], *, current_sign: CurrentSign | None, column_map: ColumnMap | None
 ) -> tuple[list[Columns], list[ExternalCurve]]:
-    """Load captures and OCV curves. Files with equal names are named by their paths.
+    """Load captures and OCV curves. Each is named by its file, or by the path if several files have this name.
 
     Raises:
         UserError: A file cannot be read.

@@ -75,7 +75,7 @@ def simulate(
     protocol: Annotated[
         str | None,
         typer.Option(
-            help=f"simulate a device with this protocol instead of a board: {', '.join(DEVICE_PROTOCOLS)} (a JK-BMS with newer frames)",
+            help=f"simulate a device with this protocol instead of a board: {', '.join(DEVICE_PROTOCOLS)}; jk-pb is a JK-BMS with newer frames",
             autocompletion=_complete_protocol,
             show_default=False,
         ),
@@ -140,7 +140,7 @@ def simulate(
             )
         relay_pack = PackWithRelay(model, load_a, soc=soc)
         board = VirtualBoard(relay_pack, rate_hz=rate_hz, speed=speed, noise_lsb=noise_lsb, seed=seed)
-        relay_pack.is_connected = lambda: board.relay_high
+        relay_pack.is_connected = lambda: board.relay_high  # set here, because the board is created with the pack
         _run(board, relay_pack, seconds)
         return
     pack = SimulatedPack(model, LOADS[load](load_a, seed), soc=soc)

@@ -26,7 +26,7 @@ from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError
 from bms_estimator.setup.broker_login import BrokerLogin
-from bms_estimator.setup.first_estimate import estimate_text, load_note, run_estimator
+from bms_estimator.setup.first_estimate import current_note, estimate_text, run_estimator
 from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.measurement import Measurement, measure
 from bms_estimator.setup.new_pack import create_pack, run_command
@@ -117,7 +117,7 @@ def new(
     """
     require_new(file)
     configure_logs(deque[str](maxlen=1))  # the wizard reports faults itself
-    with _reported_interruption(file):
+    with _report_interruption(file):
         prompts = Prompts(yes=yes)
         result = _search(search_at or ([device] if device and device.startswith("/") else _places(prompts)))
         result = _log_in(prompts, result)
@@ -127,6 +127,7 @@ def new(
         sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
         answers = replace(answers, measured=measured, name=file.stem, sensor=sensor)
         limits = (full_voltage_v, cutoff_voltage_v, max_discharge_a, max_charge_a)
+        # in the order of ``QUESTIONS``, like the help texts above
         given = (name, cell, capacity_ah, series, parallel, *limits, device_soc_std, broker)
         for question, option in zip(QUESTIONS, given, strict=True):
             if option is not None or question.is_asked(answers):
@@ -145,13 +146,13 @@ def new(
                     pack.settings, pack.cell, lambda estimate: typer.echo(estimate_text(estimate)), seconds=ESTIMATE_S
                 )
             )
-            if note := load_note(measured.current_a, pack.cell.cell.capacity_ah):
+            if note := current_note(measured.current_a, pack.cell.cell.capacity_ah):
                 typer.echo(note)
         _offer_install(prompts, file, install)
 
 
 @contextmanager
-def _reported_interruption(file: Path) -> Iterator[None]:
+def _report_interruption(file: Path) -> Iterator[None]:
     """Report Ctrl-C or the end of the input within the context, and whether the file is written.
 
     Raises:
@@ -165,7 +166,10 @@ def _reported_interruption(file: Path) -> Iterator[None]:
 
 
 def _places(prompts: Prompts) -> list[str]:
-    """Return the places to search. On a terminal they are asked for first, because a search takes up to 20 s."""
+    """Return the places to search.
+
+    On a terminal the user chooses them, because each search takes up to 20 s. Otherwise all default places are searched.
+    """
     places = " ".join(default_places())
     if "/dev/" not in places:
         typer.echo("-  no USB serial port is connected; --search PATH searches another serial port")
@@ -235,7 +239,8 @@ def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> Found
     """Return the device with this name or number. If ``may_search`` is True, return any other text as a place to search.
 
     Raises:
-        InvalidAnswerError: There is no device with this number or name. If the search failed there, the message gives its reason.
+        InvalidAnswerError: There is no device with this number or name. If the text is a place whose search failed, the message
+            gives the reason of the failure.
     """
     for number, device in enumerate(result.choices, start=1):
         if text in (str(number), device.name):

@@ -33,7 +33,7 @@ from bms_estimator.process.systemd import SystemdNotifier
 from bms_estimator.sources.captures.tables.layout import REQUIRED
 
 _ARROW_STREAM, _ARROW_FILE = b"\xff\xff\xff\xff", b"ARROW1"
-"""First bytes of an Arrow IPC stream and of an Arrow IPC file."""
+"""First bytes of an Arrow IPC stream and of an Arrow IPC file. In a file, a stream follows after 8 bytes."""
 
 
 def decode_batch(payload: bytes) -> BatchColumns:
@@ -78,8 +78,8 @@ def _unique_members(members: list[tuple[str, Any]]) -> dict[str, Any]:
 def _columns_of_object(document: object) -> BatchColumns:
     """Return the columns of an object.
 
-    An object with enough lists for a sample has one list for each column, and its other values are ignored. Any other object is
-    one row.
+    An object with at least as many lists as a sample has required columns has one list for each column; its other values are
+    ignored. Any other object is one row.
     """
     if not isinstance(document, dict) or not document:
         raise BatchError("must be an object of columns or a list of rows")
@@ -152,7 +152,7 @@ class Ingest:
         self._telemetry = TelemetryReader(nc, *store.blocks.progress)
         self._reports = BatchReports(nc)
         self._counters = self._reports.counters
-        self._trouble = ""
+        self._last_failure = ""
 
     async def run(self, stop: asyncio.Event) -> None:
         """Receive until ``stop`` is set; then complete the open blocks, and store and send them."""
@@ -190,11 +190,11 @@ class Ingest:
         except (*RETRYABLE_ERRORS, UserError) as error:
             if self._nc.is_closed:
                 raise TemporaryError("the server has closed the connection: check --creds") from None
-            if (reason := error_text(error)) != self._trouble:
+            if (reason := error_text(error)) != self._last_failure:
                 log.warning("batches cannot be received; trying again", reason=reason)
-            self._trouble = reason
+            self._last_failure = reason
             return RETRY_S
-        self._trouble = ""
+        self._last_failure = ""
         return 0.0 if messages else POLL_S
 
     async def _check(self) -> None:
@@ -231,7 +231,7 @@ class Ingest:
             await make_telemetry_stream(self._nc, self._buffer_bytes)
 
     async def _on_lost(self, lost: range) -> None:
-        """Log the sequence numbers of lost batches, and save the open blocks."""
+        """Save the open blocks, whose batches the server may have lost, too, and log the lost batches."""
         await self._save_open_blocks()
         if lost:
             self._counters["lost_batches"] += len(lost)

@@ -179,7 +179,7 @@ class IngestStore:
 
     def request_confirmation(self, pack: str) -> None:
         """Send again the last block whose number is a multiple of ``CONFIRM_EVERY``, because workers confirm such a block."""
-        self.blocks.repeat(pack, (self.blocks.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY)
+        self.blocks.resend_one(pack, (self.blocks.position(pack).next_number - 1) // CONFIRM_EVERY * CONFIRM_EVERY)
 
     async def _sync(self, progress: Progress | None) -> None:
         while not await self.blocks.sync(progress):  # noqa: ASYNC110 - a failed disk has no event

@@ -41,13 +41,15 @@ class PackType:
         settings: Settings of the packs; the name is not used.
         config_digest: Digest of the configuration of the estimator. A state of another digest is migrated.
         state_digest: Digest of the configuration that a state depends on. A state of another digest is reset.
-        pack: Pack whose estimator is bound to the unpacked record of the partition, without forecasts.
+        pack: Pack without forecasts. Its estimator uses the *unpacked record*, the one record of a partition into which the state
+            of each pack is decompressed in turn.
         alarms: Definitions of the alarms.
         short_limit_a: Minimum proven self-discharge of a cell with an internal short [A].
         meter: Charge and energy meter bound to the unpacked record.
         capacity_ah: Rated capacity of a pack [Ah]; None for a fuel cell.
         cutoff_v: Voltage at which the load of a pack is switched off [V]; NaN for a fuel cell.
-        filter_bytes: Settings of the estimator's filter, which other types may share; a view.
+        filter_bytes: View of the settings of the estimator's filter, into which those of the loaded pack are copied. Types with equal
+            digests share the estimator, and therefore this array.
         cell_file_bytes: Settings of the filter with the curves of the cell file.
     """
 
@@ -172,6 +174,7 @@ def pack_type(settings: Settings, cell: PackModel, record: NDArray[np.void], adv
     digest = config_digest(settings, cell)
     estimator = type_estimator(settings, cell).bound_to_record(record["estimator"])
 
+    # a worker receives no acknowledgements, without which a latched alarm would never end
     alarms = [each._replace(latch=False) for each in monitored_alarms(settings, cell) if each.name not in LIVE_ALARMS]
 
     def new_fit(estimator: Estimator, interval_s: float) -> SlowFit:

@@ -113,7 +113,7 @@ async def restore(nc: Client, folder: Path, report: Callable[[str], None]) -> No
     """
     backup = read_list(folder)
     configs = await _configs_of_empty_streams(nc)
-    _check_fit(backup, configs)
+    _check_restorable(backup, configs)
     try:
         await _delete_streams(nc)
         for name in RESTORE_ORDER:
@@ -148,7 +148,7 @@ async def _configs_of_empty_streams(nc: Client) -> dict[str, dict[str, Any]]:
     return {name: info.config for name, info in infos.items()}
 
 
-def _check_fit(backup: BackupList, configs: dict[str, dict[str, Any]]) -> None:
+def _check_restorable(backup: BackupList, configs: dict[str, dict[str, Any]]) -> None:
     """Check that the streams of a backup can be restored with the configurations of the new server.
 
     Raises:

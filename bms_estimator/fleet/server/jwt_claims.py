@@ -98,8 +98,8 @@ _INGEST_PUBLISH = (
 )
 _SUBSCRIBE = ("_INBOX.>", "bms.>", "fleet.>")
 _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    # Subjects to publish and to subscribe; {{name()}} is the user's name. Before 2.12.4 the server requires $MQTT.sub for
-    # QoS 1; no client can subscribe to it directly. The MQTT topic filter bms/# includes bms.
+    # Subjects to publish, and subjects to subscribe. {{name()}} is the user's name. $MQTT.sub is required for QoS 1 by servers
+    # before 2.12.4; no client can subscribe to it directly. "bms" is there because the MQTT topic filter bms/# includes it.
     Role.EDGE: (("raw.{{name()}}",), ("edge.{{name()}}.awaits", "$MQTT.sub.>")),
     Role.DASHBOARD: ((), ("bms", "bms.>", "fleet", "fleet.>", "$MQTT.sub.>")),
     Role.READER: (_READER_PUBLISH, (*_SUBSCRIBE, "hours.*")),
@@ -110,8 +110,8 @@ _ALLOWED: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
     Role.ADMIN: ((">",), (">",)),
 }
 _LIMITS: dict[Role, dict[str, int]] = {
-    # An edge has one subscription, for which the server creates three. nats-server 2.15 does not apply ``payload`` to MQTT
-    # messages; the equal limit of the stream RAW applies to them.
+    # An edge has one subscription, for which the server creates three; the rest is a margin. nats-server 2.15 does not
+    # apply ``payload`` to MQTT messages; the equal limit of the stream RAW applies to them.
     Role.EDGE: {"subs": 8, "payload": MAX_BLOCK_BYTES}
 }
 _DENIED: dict[Role, tuple[str, ...]] = {
@@ -232,7 +232,7 @@ def user_token(
         account_key: The account's public key.
         role: Role of the user.
         name: Name of the user; for an edge the name of its pack.
-        issued: Issue time (``Tenant.revoked``).
+        issued: Issue time, which ``Tenant.revoked`` is compared with.
         expires: Expiry time; None: never.
     """
     claims = {"issuer_account": account_key, "type": "user"}

@@ -49,8 +49,7 @@ class Partition:
     Args:
         number: Number of the partition.
         table: Settings and models of the packs.
-        sources: Rows of the same table, whose changes are applied in the order of the stream; None: a change takes effect
-            at once.
+        sources: Rows of the same table. With them, a change of a row takes effect at its position in the stream; None: at once.
         wall: Wall clock for publish times [s since 1970].
 
     Attributes:
@@ -59,8 +58,8 @@ class Partition:
         in_force: Table of packs that is in force at this position of the stream.
         deferred: Queue of packs with deferred messages.
         events: Numbers of blocks, samples and events in this process by name.
-        clock_errors: Errors of edges' clocks beyond the limits of ``block_order``, by pack [s], positive if ahead. A pack is
-            listed from a block with an error until the end of this hour on its clock.
+        clock_errors: Error of the edge's clock by pack [s], positive if ahead, if it is beyond the limits of ``block_order``. An
+            entry remains to the end of the hour, on that clock, of the last block with an error.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class Partition:
         wall: Callable[[], float] = time.time,
     ) -> None:
         self.number, self.sequence = number, 0
-        self._former_events: Mapping[str, int] = {}  # in the processes before
+        self._former_events: Mapping[str, int] = {}  # in earlier processes
         self.events = Counter[str]()
         self._records = PackRecords(self.events)
         self._processor = BlockProcessor(self._records.unpacked, self.events, wall)
@@ -238,6 +237,7 @@ class Partition:
         except ValueError:
             self.events["damaged"] += 1
             return BlockResult(pack)
+        # the result is ignored if the record has another version's layout, which the next block migrates
         if records.is_current(pack) and records.load(pack) is None:
             if self._processor.receive_fit(result, sequence, pack_type):
                 self._unsaved.add(pack, position(records.unpacked.delivery))
@@ -267,7 +267,11 @@ class Partition:
             return error
 
     def _process_block(self, pack: str, block: BlockHeader, arrival: Arrival, pack_type: PackType) -> BlockResult:
-        """Process a block of a known pack, or skip a lethal one, of which only the header was decoded."""
+        """Process a block of a known pack, or skip a lethal one, of which only the header was decoded.
+
+        A record with another version's layout is migrated by the next block in order. Any other block changes only the pack's
+        delivery record, which is then stored apart from the unmigrated record.
+        """
         records = self._records
         unmigrated_fields = records.load(pack)
         delivery = records.unpacked.delivery

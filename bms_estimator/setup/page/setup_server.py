@@ -40,7 +40,7 @@ class SetupServer(WebServer):
     Args:
         settings: Address and access of the page.
         file: Settings file to create.
-        token: Required token if the settings name no file with one; None: no token is required.
+        token: Token that a browser must send if the settings name no token file; None: no token is then required.
 
     Raises:
         UserError: The token cannot be read.
@@ -68,7 +68,7 @@ class SetupServer(WebServer):
             {"/": self._page},
             forms={path: functools.partial(self._run_step, step) for path, step in steps.items()},
             token=token,
-            retry=False,
+            retry=False,  # the user is at the terminal, and can choose another port
         )
 
     async def __aexit__(self, *error: object) -> None:
@@ -118,7 +118,7 @@ class SetupServer(WebServer):
         self._session.start_search(places)
 
     async def _log_in(self, fields: Fields) -> None:
-        """Search the broker again that requires a user name and a password."""
+        """Search a broker again, with the user name and password that it requires."""
         login = BrokerLogin(*(fields.get(name, "") for name in ("url", "username", "password")))
         self._session.start_search([login.address])
 

@@ -7,7 +7,7 @@ from html import escape
 from bms_estimator.installation.machine import root_command
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.setup.broker_login import BrokerLogin
-from bms_estimator.setup.first_estimate import load_note
+from bms_estimator.setup.first_estimate import current_note
 from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
 from bms_estimator.setup.new_pack import run_command
 from bms_estimator.setup.page.session import SetupSession, Step
@@ -135,7 +135,7 @@ def _done(session: SetupSession, _: str) -> str:
     warnings = f"<ul class='bad'>{_items(session.pack.warnings)}</ul>" if session.pack.warnings else ""
     install, run = escape(shlex.join(root_command("install", session.file))), escape(run_command(session.file))
     capacity_ah = session.pack.cell.cell.capacity_ah
-    note = load_note(session.measured.current_a, capacity_ah) if session.measured else ""
+    note = current_note(session.measured.current_a, capacity_ah) if session.measured else ""
     return (
         '<section class="card"><h2>State of charge</h2><div id="known"><p class="huge"><b data-q="soc">&nbsp;</b>'
         '<small>%</small></p><p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p></div>'

@@ -25,11 +25,11 @@ READS = ("forecast",)
 MAX_PAYLOAD_BYTES = 4096
 """Maximum size of a request's payload [bytes]."""
 MAX_READ_BYTES = 1 << 17
-"""Maximum size of the payload of a request of ``READS`` [bytes]. An MQTT message is limited to 16 kB by the connection."""
+"""Maximum size of the payload of a request in ``READS`` [bytes], such as a load profile. MQTT has a lower limit, 16 kB."""
 REQUESTS_PER_MIN = 6.0
 """Rate limit of all clients' requests together, granted or not [1/min]. This number of requests may arrive at once."""
 READS_PER_MIN = 30.0
-"""Rate limit of all clients' requests of ``READS`` together [1/min]. This number of requests may arrive at once."""
+"""Rate limit of all clients' requests in ``READS`` together [1/min]. This number of requests may arrive at once."""
 LOG_S = 60.0
 """Minimum interval between two log lines for each counter of rejection [s]; all rejections are counted."""
 MAX_SHOWN = 40
@@ -74,7 +74,7 @@ class RequestDispatcher:
         return tuple(command for command in COMMANDS if command in self._allowed)
 
     async def handle(self, name: str, payload: bytes) -> bytes | None:
-        """Respond to one request: JSON of status, data, error, transaction.
+        """Return the response to a request, a JSON object with the members status, data, error and transaction.
 
         Args:
             name: Name of the request.
@@ -99,7 +99,7 @@ class RequestDispatcher:
             return _response("error", None, str(error), transaction)
         except Exception as error:  # noqa: BLE001  counted and logged: a request must not end the service
             self.count_refusal("failed", name, exc_info=error)
-            return _response("error", None, "a fault of the service's own, which its log describes", transaction)
+            return _response("error", None, "internal error, which the log of the service describes", transaction)
         self._counts["granted"] += 1
         return response
 
@@ -126,7 +126,7 @@ class RequestDispatcher:
         if name not in READS and name not in self._allowed:
             raise UserError(f"{name}: not allowed; mqtt.commands in the pack file lists the allowed commands")
         if name not in self._handlers:
-            raise UserError(f"{name}: cannot be asked here")
+            raise UserError(f"{name}: not supported here")
         return self._handlers[name]
 
 

@@ -22,7 +22,7 @@ from bms_estimator.settings.pack import PackSettings, Settings
 from bms_estimator.simulation.simulated_bank import BankCells, SimulatedBank
 from bms_estimator.telemetry.cells import single_cell_fields
 from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter, Window
-from bms_estimator.telemetry.state import NAMES, make_state_payload, remaining_capacity_ah
+from bms_estimator.telemetry.state import FORECAST_FIELDS, make_state_payload, remaining_capacity_ah
 from tests.fleet.partition_stream import STORE_ID_NS, estimates_of
 
 CELLS, CAPACITY_AH, WEAK = 4, 20.0, 2
@@ -142,7 +142,7 @@ def test_state_agrees_in_every_field_with_that_of_a_replay(blocks):
     assert state.keys() == expected.keys()
     peaks = "usable_capacity_ah", "remaining_energy_wh"  # a worker does not know the peaks of the load
     assert [state[name] for name in peaks] == pytest.approx([expected[name] for name in peaks], rel=0.02)
-    forecast_only = {*NAMES, "forecast_reason"}
+    forecast_only = {*FORECAST_FIELDS, "forecast_reason"}
     assert {name for name in state if state[name] != expected[name]} <= forecast_only
     assert state["usable_capacity_ah"] < 0.9 * state["soc"] * CAPACITY_AH  # the weak cell is empty first
 

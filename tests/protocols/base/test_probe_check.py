@@ -8,7 +8,13 @@ import pytest
 from hypothesis import given, strategies as st
 
 from bms_estimator.model.arrays import SAMPLE, SampleStatus
-from bms_estimator.protocols.base.probe_check import COOLING_K_PER_S, CheckedProbes, ProbeCheck
+from bms_estimator.protocols.base.probe_check import (
+    COOLING_K_PER_S,
+    COOLING_TOLERANCE_K,
+    SUSTAINED_S,
+    CheckedProbes,
+    ProbeCheck,
+)
 
 NAN = math.nan
 
@@ -91,7 +97,8 @@ def test_a_hot_probe_is_faulty_until_it_can_have_cooled_to_its_reading(others_c:
     results = check_each_second(*[[*others_c, 70.0]] * 20, *[[*others_c, 0.0]] * 200)
     faulty_s = [second for second, result in enumerate(results) if result.faulty[-1] and second >= 20]
     assert faulty_s[0] == 20
-    assert faulty_s[-1] == pytest.approx(19 + (70.0 - 5.0) / 0.5, abs=11.0)  # the sustained 70 degC are up to 10 s old
+    # until it can have cooled by 70 K less the tolerance; the time of the last sustained 70 degC is up to 10 s before the last hot sample at 19 s
+    assert faulty_s[-1] == pytest.approx(19 + (70.0 - COOLING_TOLERANCE_K) / COOLING_K_PER_S, abs=SUSTAINED_S + 1.0)
     assert faulty_s == list(range(20, faulty_s[-1] + 1))
 
 
@@ -121,6 +128,7 @@ def test_the_heat_of_a_slow_source_is_followed(period_s: float) -> None:
     probes = ProbeCheck()
     readings_c = [25.0, 50.0, *[75.0] * 10, 20.0]
     results = [probes.check(period_s * n, [reading_c]) for n, reading_c in enumerate(readings_c)]
+    # the last reading is credible only if the probe can have cooled from 75 degC to it within a period, less the tolerance
     assert [result.faulty[0] for result in results] == [False] * 12 + [period_s * COOLING_K_PER_S < 50.0]
 
 

@@ -53,7 +53,11 @@ def test_value_of_each_type_and_word_order_is_decoded(
     assert decode(register, words_read) == round(raw * 0.01 - 2.0, 5)
 
 
-@given(st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(STRUCT_FORMATS)), st.booleans()), max_size=60))
+# few distant registers, or a dense range, in which a request reaches the maximum length
+@given(
+    st.lists(st.tuples(st.integers(0, 2000), st.sampled_from(list(STRUCT_FORMATS)), st.booleans()), max_size=60)
+    | st.lists(st.tuples(st.integers(0, 200), st.sampled_from(list(STRUCT_FORMATS)), st.booleans()), min_size=60)
+)
 def test_requests_cover_every_register_once_within_the_maximum_length(registers: list[tuple[int, str, bool]]) -> None:
     values = [
         RegisterQuantity(
@@ -73,8 +77,8 @@ def test_requests_cover_every_register_once_within_the_maximum_length(registers:
         is_near = (
             following.table == request.table and following.address <= request.address + request.words + MAX_GAP_WORDS
         )
-        # Near requests remain separate only if a value of two words would exceed the maximum length.
-        assert not is_near or following.address + 2 - request.address > MAX_WORDS - 1
+        # Near requests remain separate only if the next value, which has at most two words, would exceed the maximum length.
+        assert not is_near or following.address + 2 - request.address > MAX_WORDS
 
 
 def test_device_with_a_profile_is_read_in_as_few_requests_as_possible() -> None:

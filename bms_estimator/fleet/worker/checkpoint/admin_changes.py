@@ -40,8 +40,9 @@ MAX_CLAIMS = 20
 """Maximum number of attempts to claim a partition. Its worker may claim it back before its checkpoints are changed."""
 TABLE_REFRESH_S = 3.0 * POLL_S
 """Waiting time until all workers have removed a pack from their copies of the table [s]."""
-MAX_TOKENS = 5
-"""Maximum position of a pack's name in the subjects that are searched in streams of other programs, counted from 1."""
+MAX_PACK_TOKEN = 5
+"""Last token of a subject, counted from 1, that may be a pack's name in the streams of other programs. Assumed, because
+their subjects are unknown."""
 V = TypeVar("V")
 
 
@@ -146,7 +147,7 @@ async def _restore(store: CheckpointStore, number: int, info: CheckpointInfo, la
         raise UserError(f"partition {number}: {error}") from None
     if last_sequence is not None:
         checkpoint = replace(checkpoint, sequence=last_sequence, deferred={})
-    # all live workers read the format of the last checkpoint
+    # in the format of the last checkpoint, which the workers in use can read, even if they are of an earlier version
     await store.replace_last(claim, checkpoint, file_format=claim.pointer.kept[0].format)
 
 
@@ -202,7 +203,8 @@ async def erase_packs(nc: Client, packs: Collection[str]) -> dict[str, Erasure]:
     dead_letters = {pack: await erase_messages(nc, subjects.DEAD_STREAM, subjects.dead(pack)) for pack in packs}
     hours = {pack: await erase_messages(nc, subjects.HOURS_STREAM, subjects.hours(pack)) for pack in packs}
     for pack in packs:
-        # this stream allows no direct gets, which ``erase_messages`` needs; a request contains only sequence numbers
+        # ``erase_messages`` needs direct gets, which this stream does not allow. Its messages hold no data of the pack that would
+        # have to be overwritten, only sequence numbers.
         await nc.jetstream().purge_stream(subjects.FITS_STREAM, subject=subjects.fit_request(pack))
         await erase_messages(nc, subjects.HISTORY_STREAM, subjects.history(pack))
     await purge_keys(nc, subjects.PACKS_BUCKET, packs)
@@ -226,6 +228,7 @@ async def _check_readable(store: CheckpointStore, partition: int) -> None:
 
 
 def _later_version_error(partition: int, error: UnreadableFormatError) -> UserError:
+    """Return an error that continues the text of ``error``, which ends with the version of worker to start."""
     return UserError(f"partition {partition}: {error}, and erase the packs with that version")
 
 
@@ -316,5 +319,5 @@ def _pack_subjects(stream: str, pack: str) -> list[str]:
     }
     if stream in fleet_subjects:
         return fleet_subjects[stream]
-    leading = [".".join(["*"] * tokens) for tokens in range(1, MAX_TOKENS)]
+    leading = [".".join(["*"] * tokens) for tokens in range(1, MAX_PACK_TOKEN)]
     return [f"{each}.{pack}{rest}" for each in leading for rest in ("", ".>")]

@@ -141,7 +141,7 @@ def _probe(text_format: TextFormat, text: TextIOWrapper, finder: LayoutFinder, h
         first_line += 1 + next(index for index, line in enumerate(lines) if is_data(line))
         rows = rows[1:]
     upper_layers = next(index for index, cell in enumerate(header) if cell.strip())
-    # a column without a name that is never empty is the index of the rows
+    # no layers: the first columns have no names and are never empty, such as an index of the rows
     if not any(row and not any(row[:upper_layers]) for row in rows):
         upper_layers = 0
     rows = [row for row in rows if not any(row[:upper_layers])]
@@ -169,6 +169,11 @@ class TextTable:
     Args:
         path: The file.
         finder: Finder of the columns.
+
+    Attributes:
+        layout: Columns of the table.
+        description: Format in words.
+        warning: Warning about a row that is not used, after all blocks were read; empty without one.
 
     Raises:
         UserError: The file cannot be read, or no line is a header.
