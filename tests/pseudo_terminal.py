@@ -44,7 +44,7 @@ class PseudoTerminal:
             stdout=self._slave,
             stderr=self._slave,
             env=env | {"TERM": "xterm-256color"},
-            preexec_fn=_accept_interrupts,  # noqa: PLW1509 - it only sets a signal handler
+            preexec_fn=accept_interrupts,  # noqa: PLW1509 - it only sets a signal handler
         )
         return self
 
@@ -85,6 +85,6 @@ class PseudoTerminal:
         return termios.tcgetattr(self._slave) == self.settings
 
 
-def _accept_interrupts() -> None:
+def accept_interrupts() -> None:
     """Give SIGINT its default effect. A shell lets programs in the background ignore it, also the tests."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)

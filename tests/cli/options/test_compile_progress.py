@@ -11,7 +11,7 @@ import pytest
 from bms_estimator.cli.options.progress_bar import COMPILE_LABEL, COMPILE_TEXT
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
-from tests.pseudo_terminal import PseudoTerminal
+from tests.pseudo_terminal import PseudoTerminal, accept_interrupts
 
 
 @pytest.mark.parametrize(
@@ -33,6 +33,7 @@ def test_first_start_reports_the_compilation_and_can_be_interrupted(command: str
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=accept_interrupts,  # noqa: PLW1509 - it only sets a signal handler
     ) as process:
         try:
             assert process.stderr
