@@ -105,16 +105,17 @@ def write_packs(folder: Path, listed: Mapping[str, int]) -> None:
         OSError: The file cannot be written; the existing one remains complete.
     """
     columns = {"pack": pa.array(listed.keys(), pa.string()), "listed_hour": pa.array(listed.values(), pa.int64())}
-    path = folder / PACKS_FILE
-    unfinished = unfinished_name(path)
+    unfinished = unfinished_name(path := folder / PACKS_FILE)
     pq.write_table(pa.table(columns), unfinished, compression="zstd")
     finish(unfinished, path)
 
 
 def read_packs(folder: Path) -> dict[str, int]:
     """Return the packs that ``write_packs`` has written; empty without the file."""
-    path = folder / PACKS_FILE
-    columns = pq.read_table(path, partitioning=None).to_pydict() if path.exists() else {"pack": [], "listed_hour": []}
+    if not (path := folder / PACKS_FILE).exists():
+        return {}
+    # read at once: pyarrow opens a file twice, and the collector may replace it in between
+    columns = pq.ParquetFile(pa.BufferReader(path.read_bytes())).read().to_pydict()
     return dict(zip(columns["pack"], columns["listed_hour"], strict=True))
 
 
