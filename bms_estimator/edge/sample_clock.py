@@ -54,7 +54,7 @@ class SampleClock:
         """Return timestamps of samples that have just arrived [s since 1970].
 
         Args:
-            source_s: Floats of the source's clock [s], shape (n,). A non-finite time is replaced by the previous one.
+            source_s: Times of the source's clock [s], shape (n,). A non-finite time is replaced by the previous one.
             wall_s: Wall clock now [s since 1970].
             steady_s: Monotonic clock that continues during suspend [s].
         """

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from bms_estimator.estimator.anchor_settings import (
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
 from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import FuelCellModel, PackModel
@@ -121,9 +122,14 @@ def implausible_measurement(
         device_ah: Capacity that the device reports [Ah]; NaN: unknown.
         soc_range: Lowest and highest SOC that the pack can have after its rest; None: it may have been charged or loaded just before.
     """
+    return list(_comparison(cell)(voltage_v, current_a, device_ah, soc_range))
+
+
+def _comparison(cell: PackModel) -> Callable[[float, float, float, tuple[float, float] | None], Iterable[str]]:
+    """Return ``_contradictions`` of a pack, with its OCV, which takes most of the time and is computed only once."""
     return cell.by_kind(
-        lambda battery: list(_contradictions(battery, voltage_v, current_a, device_ah, soc_range)),
-        lambda _: list[str](),
+        lambda battery: functools.partial(_contradictions, battery, ocv_grid(battery)[0] / battery.cell.series_count),
+        lambda _: lambda *_: (),
     )
 
 
@@ -141,8 +147,13 @@ class Contradictions:
     """
 
     def __init__(self, cell: PackModel) -> None:
-        self._cell, self._device_ah, self._is_compared, self.texts = cell, math.nan, False, list[str]()
-        self._time_s, self._rest_s, self._soc_range = math.nan, 0.0, (0.0, 1.0)
+        self._one_c_a, self._compare, self._is_compared, self.texts = (
+            cell.one_c_a,
+            _comparison(cell),
+            False,
+            list[str](),
+        )
+        self._device_ah, self._time_s, self._rest_s, self._soc_range = math.nan, math.nan, 0.0, (0.0, 1.0)
 
     def add(self, time_s: float, voltage_v: float, current_a: float, device_ah: float) -> list[str]:
         """Compare the values of a sample. Return the lines that are new.
@@ -156,13 +167,13 @@ class Contradictions:
         has_first_capacity = math.isnan(self._device_ah) and not math.isnan(device_ah)
         is_first = not math.isnan(voltage_v) and (not self._is_compared or has_first_capacity)
         self._device_ah, before = self._device_ah if math.isnan(device_ah) else device_ah, self.texts
-        rests = abs(current_a) <= MAX_RESTING_C * self._cell.one_c_a
+        rests = abs(current_a) <= MAX_RESTING_C * self._one_c_a
         self._count(time_s, current_a, rests=rests)
-        compare = functools.partial(implausible_measurement, self._cell, voltage_v, current_a, self._device_ah)
-        later = compare(self._soc_range) if self._rest_s >= MIN_REST_S else []
+        compare = functools.partial(self._compare, voltage_v, current_a, self._device_ah)
+        later = list(compare(self._soc_range)) if self._rest_s >= MIN_REST_S else []
         if is_first or later or (before and rests):
             self._is_compared, known = True, {"capacity" in text: text for text in before}
-            found = {"capacity" in line: line for line in [*compare(), *later]}
+            found = {"capacity" in line: line for line in [*compare(None), *later]}
             self.texts = [
                 known.get(key, line)
                 for key, line in (known | found).items()
@@ -173,7 +184,7 @@ class Contradictions:
     def _count(self, time_s: float, current_a: float, *, rests: bool) -> None:
         """Change the duration of the rest, and the range of SOC by the charge since the sample before. Reset both after a gap."""
         elapsed_s, self._time_s = time_s - self._time_s, time_s
-        change = -current_a * elapsed_s / (3600.0 * self._cell.one_c_a)
+        change = -current_a * elapsed_s / (3600.0 * self._one_c_a)
         if not 0.0 <= elapsed_s <= MAX_GAP_S or math.isnan(change):
             self._rest_s, self._soc_range = 0.0, (0.0, 1.0)
             return
@@ -184,19 +195,28 @@ class Contradictions:
 
 
 def _contradictions(
-    cell: CellModel, voltage_v: float, current_a: float, device_ah: float, soc_range: tuple[float, float] | None
+    cell: CellModel,
+    ocv_v: Floats,
+    voltage_v: float,
+    current_a: float,
+    device_ah: float,
+    soc_range: tuple[float, float] | None,
 ) -> Iterator[str]:
+    """Yield the lines of ``implausible_measurement``. ``ocv_v`` is the OCV of one cell at evenly spaced SOCs 0..1 [V]."""
     capacity_ah, series = cell.cell.capacity_ah, cell.cell.series_count
     if abs(device_ah - capacity_ah) > CAPACITY_TOLERANCE * max(device_ah, capacity_ah):
         yield f"pack.capacity_ah: the pack has {capacity_ah:g} Ah, but its device reports {device_ah:g} Ah"
-    ocv_v = ocv_grid(cell)[0] / series
-    counted = soc_range and (min(soc_range[0], COUNTED_SOC[0]), max(soc_range[1], COUNTED_SOC[1]))
-    low_soc, high_soc = counted or RESTING_SOC
+    low_soc, high_soc = (
+        (min(soc_range[0], COUNTED_SOC[0]), max(soc_range[1], COUNTED_SOC[1])) if soc_range else RESTING_SOC
+    )
     low_v, mid_v, high_v = np.interp((low_soc, 0.5, high_soc), np.linspace(0.0, 1.0, ocv_v.size), ocv_v)
     rests, cell_v = abs(current_a) <= MAX_RESTING_C * capacity_ah, voltage_v / series
     if soc_range:
-        low_v, high_v = low_v - COUNTED_V, high_v + (COUNTED_V if high_soc <= COUNTED_SOC[1] else ABOVE_FULL_V)
-        state = f"after a rest at an SOC of {low_soc:.2f} to {high_soc:.2f}"
+        low_v, high_v, state = (
+            low_v - COUNTED_V,
+            high_v + (COUNTED_V if high_soc <= COUNTED_SOC[1] else ABOVE_FULL_V),
+            f"after a rest at an SOC of {low_soc:.2f} to {high_soc:.2f}",
+        )
     elif rests:
         low_v, high_v, state = (
             low_v - RESTING_V,
