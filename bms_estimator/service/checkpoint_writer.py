@@ -176,8 +176,7 @@ class CheckpointWriter:
     @property
     def _lacks_alarm(self) -> bool:
         """True if the last save lacks a raised alarm."""
-        saved = self._saved_counters.alarms if self._saved_counters else ""
-        return lacks_alarm(saved, self._alarms.saved_state)
+        return lacks_alarm(self._saved_counters.alarms if self._saved_counters else "", self._alarms.saved_state)
 
     async def _is_run_file_missing(self) -> bool:
         """Return True if the file with counters and alarms was deleted."""
@@ -187,9 +186,8 @@ class CheckpointWriter:
     async def _save_counters(self, *, clean: bool = False) -> bool:
         """Save counters and alarms if they have changed. Return False if they cannot be written."""
         hooks = self._hooks.finished_hashes if clean else None  # after a crash all hooks repeat their jobs
-        alarms, slots = self._alarms.saved_state, self._slots.cell_indices
+        alarms, slots, file = self._alarms.saved_state, self._slots.cell_indices, self._files.run_file
         counters = RunCounters(self._status.restarts, self._totals.total, clean, alarms, hooks, slots)
-        file = self._files.run_file
         if counters == self._saved_counters:
             return True
         if not await self._write(lambda: file.save(counters), file.path):
@@ -265,8 +263,10 @@ class CheckpointWriter:
         # asyncio.wait_for of Python 3.11 may swallow a cancellation
         await asyncio.wait({future}, timeout=DISK_HUNG_S)
         if not future.done():
-            self._status.checkpoint = "not saved: the disk hangs"
+            before, self._status.checkpoint = self._status.checkpoint, "not saved: the disk hangs"
             log.warning("checkpoint cannot be saved", file=str(file), error="the disk hangs")
+            await asyncio.wait({future})
+            self._status.checkpoint = before
         return await future
 
 

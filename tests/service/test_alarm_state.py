@@ -611,14 +611,14 @@ async def test_an_alarm_that_a_failing_disk_does_not_save_is_announced_as_lost(
 async def test_a_disk_that_hangs_between_two_saves_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoint_writer, "CHECK_INTERVAL_S", 0.01)
     monkeypatch.setattr(checkpoint_writer, "DISK_HUNG_S", 0.01)
-    settings, may_continue = edit_settings("state", checkpoint_s=1e6), threading.Event()
-    files = StateFiles(tmp_path, settings, CELL)
-    async with running(files, settings) as (source, sink):
+    files, may_continue = StateFiles(tmp_path, edit_settings("state", checkpoint_s=1e6), CELL), threading.Event()
+    async with running(files, edit_settings("state", checkpoint_s=1e6)) as (source, sink):
         source.give(*NORMAL)
         await sink.until(lambda s: s.health.checkpoint == "saved")
         files.thread.submit(may_continue.wait)
         await sink.until(lambda s: s.health.checkpoint == "not saved: the disk hangs", skip=len(sink.snapshots))
         may_continue.set()
+        await sink.until(lambda s: s.health.checkpoint == "saved", skip=len(sink.snapshots))
 
 
 async def test_an_alarm_that_is_saved_at_the_second_attempt_is_not_lost(
