@@ -37,6 +37,12 @@ def test_main_values_are_shown_on_any_screen_size(demo: PseudoTerminal, columns:
     demo.until(lambda: shows_soc(demo))
 
 
+def test_unchanged_lines_are_not_drawn_with_each_screen(demo: PseudoTerminal) -> None:
+    begin = len(demo.output)
+    demo.until(lambda: len(set(re.findall(r"\d\d:\d\d:\d\dZ", demo.output[begin:]))) > 5)
+    assert demo.output[begin:].count("Voltage") < 2  # a repaint draws the heading too
+
+
 def test_interrupted_demo_prints_a_summary_and_restores_the_terminal(demo: PseudoTerminal) -> None:
     """This test ends the demo that the tests before it share."""
     demo.until(lambda: shows_soc(demo))
