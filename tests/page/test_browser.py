@@ -21,6 +21,7 @@ from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.mqtt.topic_cache import MAX_DEVICES
 from bms_estimator.page.broker_page import dashboard
 from bms_estimator.settings.connections import MqttSettings, PageSettings
+from bms_estimator.sinks.home_assistant.discovery import BATTERY
 from bms_estimator.telemetry.state import forecast_fields, no_forecast
 from tests.free_port import free_port
 from tests.mosquitto import Broker, Listener
@@ -172,6 +173,8 @@ async def test_page_shows_the_published_values_with_units(browser: Browser, prog
         await page_tab.page.get_by_text("For experts").click()
         gain = page_tab.page.locator("#facts div", has_text="Observer, N(k)")
         assert await gain.inner_text() == "Observer, N(k)\n0.97"
+        for key in ("remaining_energy_wh", "remaining_capacity_ah", "usable_capacity_ah"):
+            assert await page_tab.page.locator(f"[data-of={key}]", has_text=BATTERY[key].name).count() == 1
         meter = page_tab.page.get_by_role("meter", name="State of charge")
         assert await meter.get_attribute("aria-valuenow") == "43"
         assert (

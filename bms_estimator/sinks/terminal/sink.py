@@ -71,7 +71,7 @@ def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:
         table.add_column("True\nSOC %", no_wrap=True, style="magenta")
     table.add_column(f"State at\n{clock_text(view.now_s)}", no_wrap=True)
     is_wide = width >= MIN_WIDE_TABLE_CELLS
-    remaining = ("Remaining\nAh",) if is_wide else ()
+    remaining = ("To 0 %\nAh",) if is_wide else ()
     for heading in ("Voltage\nV", "Current\nA", "Power\nW", *remaining, "To cut-off\nh, 90 %", "Innovation\nmV"):
         table.add_column(heading, justify="right", no_wrap=True)
     state, is_stale = pack.fields("state"), pack.stale_since() is not None
