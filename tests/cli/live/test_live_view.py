@@ -52,8 +52,7 @@ def test_interrupted_demo_prints_a_summary_and_restores_the_terminal(demo: Pseud
     assert demo.process.returncode == 0
     assert demo.is_as_before()
     after_view = demo.output.split(ALTERNATE)[-1]
-    assert BACK in after_view
-    assert CURSOR in after_view
+    assert [sequence in after_view for sequence in (BACK, CURSOR)] == [True, True]
     assert re.search(r"SOC error -20\.00% at the start, ", after_view.replace("\r\n", " "))
     assert "Traceback" not in demo.output
 
