@@ -98,7 +98,9 @@ class Estimate(Payload):
     )
     remaining_capacity_ah: Annotated[
         float | None,
-        Quantity(Entity("Charge left to 0 %", "Ah", 2, 0.02, is_primary=True, icon="battery-medium"), packs="batteries"),
+        Quantity(
+            Entity("Charge left to 0 %", "Ah", 2, 0.02, is_primary=True, icon="battery-medium"), packs="batteries"
+        ),
     ] = Field(description="remaining charge to SOC 0 [Ah]")
     remaining_energy_wh: Annotated[
         float | None,
