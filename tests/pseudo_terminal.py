@@ -15,8 +15,8 @@ from typing import Self
 from tests.command_line import PROGRAM
 from tests.patience import LONG_S
 
-HOME, ALTERNATE, BACK, CURSOR = "\x1b[H", "\x1b[?1049h", "\x1b[?1049l", "\x1b[?25h"
-"""Control sequences: cursor to the top left, enter and leave the alternate screen, show the cursor."""
+ALTERNATE, BACK, CURSOR = "\x1b[?1049h", "\x1b[?1049l", "\x1b[?25h"
+"""Control sequences: enter and leave the alternate screen, show the cursor."""
 
 
 class PseudoTerminal:
@@ -55,6 +55,7 @@ class PseudoTerminal:
         os.close(self._slave)
 
     def resize(self, columns: int, rows: int) -> None:
+        self._rows = rows
         fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("4H", rows, columns, 0, 0))
 
     def press(self, keys: bytes) -> None:
@@ -75,10 +76,13 @@ class PseudoTerminal:
         return self.process.poll() is not None
 
     def screen(self) -> list[str]:
-        """Return the lines of the last complete screen without control sequences; empty before the first screen."""
-        # Only the text before the last HOME is complete: the program may still be drawing the screen after it.
-        screens = self.output.split(HOME)
-        return re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", screens[-2]).split("\r\n") if len(screens) > 2 else []
+        """Return the lines on the screen without control sequences. Each is written after a move of the cursor to its row."""
+        moves = re.split(r"\x1b\[(\d+);1H", self.output.split(ALTERNATE)[-1])[1:]
+        rows = {
+            int(row): re.sub(r"\x1b\[[?\d;]*[a-zA-Z]", "", text)
+            for row, text in zip(moves[::2], moves[1::2], strict=True)
+        }
+        return [rows[row] for row in sorted(rows) if row <= self._rows]
 
     def is_as_before(self) -> bool:
         """Return True if the program has restored the settings of the terminal."""

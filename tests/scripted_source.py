@@ -21,7 +21,7 @@ class ScriptedSource:
         self.silence_reason: str | None = None
         self.board: dict[str, str] = {}
         self.clock_ppm: float | None = None
-        self.clock_fault = ""
+        self.clock_fault = self.conflict = ""
         self._queue: asyncio.Queue[ReceivedSamples | None] = asyncio.Queue()
 
     async def __aenter__(self) -> Self:

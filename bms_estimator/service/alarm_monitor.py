@@ -96,6 +96,7 @@ class AlarmMonitor:
                 probes=received.probes,
                 cells_fault=cells_fault,
                 clock_fault=self._source.clock_fault,
+                conflict=self._source.conflict,
                 lost=self._lost_samples,
                 cell_alarm_inputs=cell_alarm_inputs(cells) if cells is not None and is_new else None,
                 weak_cell_std=slow_fit.weak_cell_std if slow_fit else math.nan,

@@ -105,6 +105,7 @@ ALARM_KINDS: Mapping[AlarmName, AlarmKind] = {
     "sensor_fault": AlarmKind(
         "samples are lost, unusable or from two publishers",
         "check sensors and wiring; the counters in topic health name the fault",
+        is_fraction=True,
     ),
     "model_mismatch": AlarmKind(
         "measured and estimated voltage disagree",

@@ -82,6 +82,11 @@ class PairedSource:
         """Description of a fault of the monitor's clock; empty without one."""
         return self._monitor.clock_fault
 
+    @property
+    def conflict(self) -> str:
+        """Description of a second publisher of the monitor's samples; empty without one."""
+        return self._monitor.conflict
+
     async def __aenter__(self) -> Self:
         async with contextlib.AsyncExitStack() as stack:
             await stack.enter_async_context(self._monitor)

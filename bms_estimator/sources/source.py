@@ -93,6 +93,10 @@ class Source(Protocol):
     def clock_fault(self) -> str:
         """Description of a fault of the device's clock; empty without one."""
 
+    @property
+    def conflict(self) -> str:
+        """Description of a second publisher of the samples, a sentence; empty without one."""
+
     def __aiter__(self) -> AsyncIterator[ReceivedSamples]:
         """Yield blocks of samples; none of them is empty."""
 
@@ -121,7 +125,12 @@ class LineProducer(ABC):
     """Producer of samples from a device that is not on a serial port. It does all I/O of the source.
 
     It yields samples as lines of JSON, like a board that prints text, so that one reader serves both.
+
+    Attributes:
+        conflict: Description of a second publisher of the samples, a sentence; empty without one.
     """
+
+    conflict: str = ""
 
     @property
     @abstractmethod
@@ -226,6 +235,11 @@ class LineSource:
     def clock_fault(self) -> str:
         """Description of a fault of the device's clock; empty without one."""
         return self._decoder.clock_fault
+
+    @property
+    def conflict(self) -> str:
+        """Description of a second publisher of the samples, a sentence; empty without one."""
+        return self._producer.conflict
 
     store_current_zero: None = None
     """Function that sets the zero of the current; None: lines have no such command."""

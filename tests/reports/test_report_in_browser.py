@@ -65,7 +65,7 @@ async def test_figures_and_tables_are_not_cut_by_a_page_break(browser, report):
 def history_page(tmp_path):
     """Return the page on a history of 30 days with 30 events."""
     text = (
-        "sensor_fault: samples are lost, unusable or from two publishers: 0.5896, limit 0.1; check sensors and wiring"
+        "sensor_fault: samples are lost, unusable or from two publishers: 58.96 %, limit 10 %; check sensors and wiring"
     )
     events = [(3600.0 * hour, "alarm_raised", text) for hour in range(30)]
     history = replace(history_of(3600.0 * np.arange(30 * 24)), events=events)

@@ -203,7 +203,8 @@ async def test_a_second_publisher_raises_sensor_fault(broker: Broker) -> None:
             await listener.wait_json(STATE_TOPIC, lambda s: s["frames_received"] > 20)
             assert not json.loads(await listener.wait("bms/pack/alarm/sensor_fault"))["active"]
             attacked.set()
-            await listener.wait_json("bms/pack/alarm/sensor_fault", lambda alarm: alarm["active"])
+            alarm = await listener.wait_json("bms/pack/alarm/sensor_fault", lambda alarm: alarm["active"])
+            assert alarm["text"].startswith("two publishers write the same topic (home/pack: current ")
             await listener.wait_json(HEALTH_TOPIC, lambda h: h["line"]["publisher_errors"] > 0)
         finally:
             await end_tasks(publishers)

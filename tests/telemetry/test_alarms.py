@@ -681,6 +681,15 @@ def test_an_alarm_of_which_a_quantity_was_never_measured_is_not_reported_when_an
     assert "charging_below_freezing" not in watched, "no temperature was ever measured"
 
 
+def test_sensor_fault_names_two_publishers_and_then_the_share_of_lost_samples() -> None:
+    alarms, samples = make_evaluator({"sensor_fault": {"delay_s": 0.0}}), np.zeros(2, SAMPLE)
+    for lost in range(2):
+        samples["time_s"], samples["voltage_v"] = (10.0 * lost, 10.0 * lost + 1.0), 7.4
+        alarms.evaluate(samples, NO_TRACE, NO_CELLS, WALL_S, lost=lost, conflict=f"two publishers, {lost}")
+    (text,) = [alarm.text for alarm in alarms.report() if alarm.name == "sensor_fault"]
+    assert text.startswith("two publishers, 0; samples are lost, unusable or from two publishers: 100 %, limit 10 %; ")
+
+
 def test_link_lost_names_the_reason_that_the_source_knows_later() -> None:
     alarms = make_evaluator()
     for reason in ("", "the publisher reports offline", ""):

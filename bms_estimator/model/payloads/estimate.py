@@ -98,11 +98,13 @@ class Estimate(Payload):
     )
     remaining_capacity_ah: Annotated[
         float | None,
-        Quantity(Entity("Remaining charge", "Ah", 2, 0.02, is_primary=True, icon="battery-medium"), packs="batteries"),
+        Quantity(
+            Entity("Charge left to 0 %", "Ah", 2, 0.02, is_primary=True, icon="battery-medium"), packs="batteries"
+        ),
     ] = Field(description="remaining charge to SOC 0 [Ah]")
     remaining_energy_wh: Annotated[
         float | None,
-        Quantity(Entity("Remaining energy", "Wh", 1, 0.2, "energy_storage", is_primary=True), packs="batteries"),
+        Quantity(Entity("Energy left to cut-off", "Wh", 1, 0.2, "energy_storage", is_primary=True), packs="batteries"),
     ] = Field(
         description="remaining energy at the terminals to the cut-off voltage at the present load and temperature [Wh]; null "
         "without the identifier and for a fuel cell, with a forecast_reason"
@@ -124,7 +126,7 @@ class Estimate(Payload):
     )
     time_to_full_s: float | None = Field(description="time until the charger ends the charge [s]; null unless charging")
     usable_capacity_ah: Annotated[
-        float | None, Quantity(raw_entity("Usable charge at this load", "Ah", 2), packs="batteries")
+        float | None, Quantity(raw_entity("Charge left to cut-off", "Ah", 2), packs="batteries")
     ] = Field(description="remaining charge to the cut-off voltage at the present load and temperature [Ah]")
     available_discharge_power_10s_w: Annotated[
         float | None,

@@ -9,7 +9,7 @@ const SHOWN = {
 	innovation_v: f.millivolts, device_soc: (x) => f.percent(x, 0), usable_capacity_ah: f.ampereHours, remaining_energy_wh: f.wattHours, remaining_capacity_ah: f.ampereHours,
 	energy_out_kwh: (x) => f.wattHours(1e3 * x), energy_in_kwh: (x) => f.wattHours(1e3 * x), soc: f.percent, weakest_cell_soc: f.percent, stability_margin: f.percent,
 };
-const UNCERTAIN = ["soc_std", "time_to_cutoff_s", "time_to_full_s", "remaining_energy_wh", "remaining_capacity_ah", "weakest_cell_soc"];
+const UNCERTAIN = ["soc_std", "time_to_cutoff_s", "time_to_full_s", "remaining_energy_wh", "remaining_capacity_ah", "usable_capacity_ah", "weakest_cell_soc"];
 const parts = [...document.querySelectorAll("[data-of]")]; // shown only if there is a value
 
 /** Time to the cut-off, or while charging to full, with its 90 % band. Below ten minutes a single load peak decides, so only the band is shown. */

@@ -8,21 +8,20 @@ import io
 import os
 import sys
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import IO, Self, TypeVar, cast
 
 from rich import box
 from rich.console import Console, Group, RenderableType
-from rich.live import Live
+from rich.screen import Screen
 from rich.table import Table
 from rich.text import Text
 
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.connection import Message
-from bms_estimator.mqtt.topic_cache import DeviceMessage, DeviceTopics, TopicCache
+from bms_estimator.mqtt.topic_cache import DeviceMessage, TopicCache
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
 from bms_estimator.sinks.terminal.json_fields import JsonFields
 from bms_estimator.sinks.terminal.view_state import (
@@ -72,7 +71,7 @@ def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:
         table.add_column("True\nSOC %", no_wrap=True, style="magenta")
     table.add_column(f"State at\n{clock_text(view.now_s)}", no_wrap=True)
     is_wide = width >= MIN_WIDE_TABLE_CELLS
-    remaining = ("Remaining\nAh",) if is_wide else ()
+    remaining = ("To 0 %\nAh",) if is_wide else ()
     for heading in ("Voltage\nV", "Current\nA", "Power\nW", *remaining, "To cut-off\nh, 90 %", "Innovation\nmV"):
         table.add_column(heading, justify="right", no_wrap=True)
     state, is_stale = pack.fields("state"), pack.stale_since() is not None
@@ -151,39 +150,43 @@ def _state_line(device: str, state: JsonFields, true_soc: float | None) -> str:
 
 REDRAW_S = 0.25
 """Minimum interval between two screens, at any publish rate [s]."""
+REPAINT_S = 30.0
+"""Interval after which unchanged lines are drawn too, because another program may have written over them [s]."""
 MAX_WAITING_LINES = 1000
 """Maximum number of lines that wait for a blocked pipe. Beyond it, the oldest line is dropped."""
 SHUTDOWN_TIMEOUT_S = 2.0
 """Timeout of the last write to a blocked terminal [s]."""
 
 
+BASE_TOPIC = "bms"
+"""Base topic of the messages, which are not sent."""
 T = TypeVar("T")
 
 
-class LiveView:
-    """View of the pack's publications on standard output. No method waits for a blocked standard output.
+class TerminalSink:
+    """Sink that shows snapshots as a subscriber would see them. No method waits for a blocked standard output.
 
     Args:
-        devices: Last publications of the pack, by its name.
         log: Log lines. The last of them are shown, because the screen hides log output.
         hint: Last line of the screen.
         true_soc: Returns the pack's true SOC 0..1 at the last sample, in a simulation.
-        wall: Wall clock, seconds since 1970.
+        clock: Wall clock and monotonic clock.
     """
 
     def __init__(
         self,
-        devices: Mapping[str, DeviceTopics],
         *,
         log: Iterable[str] = (),
         hint: str = "",
         true_soc: Callable[[], float | None] = lambda: None,
-        wall: Callable[[], float] = time.time,
+        clock: Clock | None = None,
     ) -> None:
+        self._clock, self._cache, self._sent = clock or Clock(), TopicCache(BASE_TOPIC), PublishedState()
+        self._builder: MessageBuilder | None = None
+        self._previous: Snapshot | None = None
         self._console = Console(file=cast("IO[str]", _UnbufferedStdout()))
         self._terminal = self._console.is_terminal
-        self._devices, self._log, self._hint, self._wall = devices, log, hint, wall
-        self._true_soc = true_soc
+        self._log, self._hint, self._true_soc = log, hint, true_soc
         self._states: deque[ViewState] = deque(maxlen=1)  # a newer state replaces one that was not drawn
         self._lines: deque[str] = deque(maxlen=MAX_WAITING_LINES)
         self._draw_event, self._closing = threading.Event(), threading.Event()
@@ -203,27 +206,37 @@ class LiveView:
         self._draw_event.set()
         await asyncio.to_thread(self._thread.join, SHUTDOWN_TIMEOUT_S)
 
-    def on_message(self, message: DeviceMessage) -> None:
-        """Queue the line of a message, if standard output is no terminal."""
-        if not self._terminal and (line := text_line(message, self._true_soc())) is not None:
-            self._lines.append(line)
-
-    def show(self) -> None:
-        """Let the thread draw the present state, or write the queued lines.
+    def publish(self, snapshot: Snapshot) -> None:
+        """Let the thread draw a snapshot, or write a line for each of its messages if standard output is no terminal.
 
         Raises:
             OSError: Standard output could not be written: its reader has gone, or its disk is full.
         """
+        for message in self._messages(snapshot):
+            received = self._cache.add_message(message.topic, message.payload, self._clock.wall())
+            if received and not self._terminal and (line := text_line(received, self._true_soc())) is not None:
+                self._lines.append(line)
         if self._error is not None:
             raise self._error
         if self._terminal:
             self._states.append(self._present_state())
         self._draw_event.set()
 
+    def _messages(self, snapshot: Snapshot) -> list[Message]:
+        """Return the messages that a broker would receive."""
+        birth: list[Message] = []
+        if self._builder is None:
+            self._builder = MessageBuilder(BASE_TOPIC, snapshot.info.device)
+            birth = self._builder.birth_messages()
+        guaranteed_messages = self._builder.guaranteed_messages(self._previous, snapshot)
+        live, self._sent = self._builder.live_messages(self._sent, snapshot, self._clock.monotonic())
+        self._previous = snapshot
+        return [*birth, *guaranteed_messages, *live]
+
     def _present_state(self) -> ViewState:
         """Return a copy, because the drawing thread must not see changes."""
-        packs = (PackView(name, dict(device.topics)) for name, device in self._devices.items())
-        return ViewState(self._wall(), next(packs, None), tuple(self._log), self._hint, self._true_soc())
+        packs = (PackView(name, dict(device.topics)) for name, device in self._cache.devices.items())
+        return ViewState(self._clock.wall(), next(packs, None), tuple(self._log), self._hint, self._true_soc())
 
     def _run_thread(self) -> None:
         try:
@@ -236,14 +249,16 @@ class LiveView:
             self._error = error
 
     def _draw_screens(self) -> None:
-        """Draw the newest state at most once each ``REDRAW_S``. The last screen stays on the terminal."""
-        screen = None
-        with Live(
-            console=self._console, auto_refresh=False, screen=True, redirect_stdout=False, redirect_stderr=False
-        ) as live:
+        """Draw the newest state at most once each ``REDRAW_S``, only its changed lines. The last screen stays on the terminal."""
+        screen, drawn = None, set[tuple[object, ...]]()
+        with self._console.screen():
             for state in self._until_closed(self._states):
-                screen = build_screen(state, self._console.width)
-                live.update(screen, refresh=True)
+                screen, key = build_screen(state, self._console.width), (self._console.size, state.now_s // REPAINT_S)
+                with self._console.capture() as capture:
+                    self._console.print(Screen(screen), end="")
+                lines = [(key, row, line) for row, line in enumerate(capture.get().split("\n"), 1)]
+                self._console.file.write("".join(f"\x1b[{each[1]};1H{each[2]}" for each in lines if each not in drawn))
+                drawn = set(lines)
                 self._closing.wait(REDRAW_S)
         if screen is not None:
             self._console.print(screen)
@@ -273,61 +288,3 @@ class _UnbufferedStdout(io.TextIOBase):
 
     def isatty(self) -> bool:
         return sys.stdout.isatty()
-
-
-BASE_TOPIC = "bms"
-"""Base topic of the messages, which are not sent."""
-
-
-class TerminalSink:
-    """Sink that shows snapshots as a subscriber would see them. ``publish`` does not wait for a blocked stdout.
-
-    Args:
-        log, hint, true_soc: As in ``LiveView``.
-        clock: Wall clock and monotonic clock.
-    """
-
-    def __init__(
-        self,
-        *,
-        log: Iterable[str] = (),
-        hint: str = "",
-        true_soc: Callable[[], float | None] = lambda: None,
-        clock: Clock | None = None,
-    ) -> None:
-        self._clock = clock or Clock()
-        self._cache = TopicCache(BASE_TOPIC)
-        self._view = LiveView(self._cache.devices, log=log, hint=hint, true_soc=true_soc, wall=self._clock.wall)
-        self._builder: MessageBuilder | None = None
-        self._previous: Snapshot | None = None
-        self._sent = PublishedState()
-
-    async def __aenter__(self) -> Self:
-        await self._view.__aenter__()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._view.__aexit__(None, None, None)
-
-    def publish(self, snapshot: Snapshot) -> None:
-        """Show a snapshot.
-
-        Raises:
-            OSError: Standard output could not be written.
-        """
-        for message in self._messages(snapshot):
-            received = self._cache.add_message(message.topic, message.payload, self._clock.wall())
-            if received is not None:
-                self._view.on_message(received)
-        self._view.show()
-
-    def _messages(self, snapshot: Snapshot) -> list[Message]:
-        """Return the messages that a broker would receive."""
-        birth: list[Message] = []
-        if self._builder is None:
-            self._builder = MessageBuilder(BASE_TOPIC, snapshot.info.device)
-            birth = self._builder.birth_messages()
-        guaranteed_messages = self._builder.guaranteed_messages(self._previous, snapshot)
-        live, self._sent = self._builder.live_messages(self._sent, snapshot, self._clock.monotonic())
-        self._previous = snapshot
-        return [*birth, *guaranteed_messages, *live]

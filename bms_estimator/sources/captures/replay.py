@@ -163,6 +163,9 @@ class Replay:
     silence_reason: str | None = None
     """Reason why no samples arrive; None, because a capture always has a next sample or ends."""
 
+    conflict = ""
+    """A capture does not record which publisher sent a sample."""
+
     def __init__(
         self,
         capture: Capture,

@@ -64,7 +64,6 @@ class MqttProducer(LineProducer):
         configured = brokers(mqtt)
         self._broker, self._brokers = configured[0], itertools.cycle(configured)
         self._connect = connect or BrokerConnector(mqtt)
-        self._has_conflict = False
         self._logged_quantities = set[str]()
         self._lost_messages: Counter[str] = Counter({"too_long": 0, "overflow": 0})
         self._options = ConnectOptions(
@@ -150,13 +149,13 @@ class MqttProducer(LineProducer):
                 raise SourceUnavailableError(f"not allowed to write {message.topic}: {refusal.reason}")
 
     def _log_conflict(self) -> None:
-        """Log the beginning and the end of a conflict between two publishers."""
-        conflict = self._assembler.conflict
-        if bool(conflict) == self._has_conflict:
+        """Log the beginning and the end of a conflict between two publishers, and update its description."""
+        values = self._assembler.conflict
+        if bool(values) == bool(self.conflict):
             return
-        self._has_conflict = bool(conflict)
-        if conflict:
-            log.warning("two publishers write the same topic; stop one of them", values=conflict)
+        self.conflict = values and f"two publishers write the same topic ({values}); stop one of them"
+        if values:
+            log.warning("two publishers write the same topic; stop one of them", values=values)
         else:
             log.info("one publisher writes the topic again")
 

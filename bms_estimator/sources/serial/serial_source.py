@@ -62,6 +62,9 @@ class SerialSource:
         silent_s: Time without a frame after which the line counts as silent [s].
     """
 
+    conflict = ""
+    """A port has no second publisher."""
+
     def __init__(
         self,
         settings: SensorSettings,

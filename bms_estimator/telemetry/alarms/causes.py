@@ -15,7 +15,7 @@ from bms_estimator.telemetry.alarms.definitions import AlarmMessage, RaisedAlarm
 from bms_estimator.telemetry.cells import NO_FAULTY_CELL, CellAlarmInput
 from bms_estimator.telemetry.state import UNKNOWN_SOC, missing_margin_reason
 
-FaultyInput = Quantity | Literal["time"]
+FaultyInput = Quantity | Literal["time", "publishers"]
 """Faulty quantity of the samples."""
 PROBE_TEXT = "a temperature probe is broken, loose or missing, or far from the others: check it"
 """Fault of temperature probes, and its remedy."""

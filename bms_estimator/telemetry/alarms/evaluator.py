@@ -81,6 +81,7 @@ class AlarmEvaluator:
         probes: ProbeBlock = NO_PROBES,
         cells_fault: str = "",
         clock_fault: str = "",
+        conflict: str = "",
         lost: int = 0,
         cell_alarm_inputs: CellAlarmInputs | None = None,
         weak_cell_std: float = math.nan,
@@ -96,6 +97,7 @@ class AlarmEvaluator:
             probes: Their temperature probes; empty if there are none.
             cells_fault: Reason why the cell voltages cannot be used; empty if they can.
             clock_fault: Fault of the source's clock as a sentence; empty without a fault.
+            conflict: Description of a second publisher of the samples, a sentence; empty without one.
             lost: Number of samples since start that were lost on the line.
             cell_alarm_inputs: New faults of single cells; None without a new estimate.
             weak_cell_std: Deviation of the last discharge from the bank's reference [std]; NaN if unknown.
@@ -108,6 +110,8 @@ class AlarmEvaluator:
         io, times_s = alarms.kernel.io, samples["time_s"]
         if cells_fault:
             causes.input_faults.add("cells", cells_fault, cells_fault)
+        if conflict:
+            causes.input_faults.add("publishers", "two", conflict)
         io["cells_unusable"] = bool(cells_fault)
         alarms.record["faults"] |= (bool(cells_fault) << CELLS) | (bool(causes.board_fault) << FAULTY_BOARD)
         last_s = (

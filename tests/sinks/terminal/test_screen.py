@@ -85,9 +85,8 @@ def test_80_by_24_cells_show_a_pack_with_three_alarms_and_the_log_and_the_hint()
     topics = alarms | alarm("link_lost", "critical", active=False) | {"state": ESTIMATE}
     view = ViewState(NOW, pack_view(topics), LOG, HINT, true_soc=0.497)
     text = " ".join(" ".join(lines_of(view, 80, 24)).split())
-    assert "pack 50.00 ± 4.00 49.70 live 24.123 +12.500 +301.54 - -54.3" in text
-    assert LOG[-1][:50] in text
-    assert HINT in text
+    values = "pack 50.00 ± 4.00 49.70 live 24.123 +12.500 +301.54 - -54.3"
+    assert [part for part in (values, LOG[-1][:50], HINT) if part not in text] == []
     critical_at = text.index("critical since 2024-05-01T12:00:00.000Z: cell_over_voltage: 12.3 % is below the limit")
     assert critical_at < text.index("warning since 2024-05-01T12:00:00.000Z: soc_low:") < text.index("imbalance:")
     assert "link_lost" not in text
@@ -95,10 +94,7 @@ def test_80_by_24_cells_show_a_pack_with_three_alarms_and_the_log_and_the_hint()
 
 def test_the_band_of_the_time_to_the_cut_off_is_shown_on_a_narrow_screen_in_place_of_the_remaining_charge() -> None:
     narrow, wide = ("\n".join(lines_of(ViewState(NOW, pack_view()), columns)) for columns in (80, 100))
-    assert "1:23-2:45" in narrow
-    assert "Remaining" not in narrow
-    assert "1:23-2:45" in wide
-    assert "Remaining" in wide
+    assert [("1:23-2:45" in screen, "To 0 %" in screen) for screen in (narrow, wide)] == [(True, False), (True, True)]
 
 
 def test_a_line_of_text_has_the_time_to_the_cut_off_with_its_band() -> None:
@@ -149,5 +145,4 @@ def test_no_payload_breaks_the_screen_or_controls_the_terminal(garbage: Any) -> 
 
 def test_screen_without_a_pack_shows_the_hint() -> None:
     text = " ".join(lines_of(ViewState(NOW, hint=HINT)))
-    assert "nothing has been published yet" in text
-    assert HINT in text
+    assert [part for part in ("nothing has been published yet", HINT) if part not in text] == []

@@ -298,7 +298,7 @@ function answerTable(name, [title, note, noRows, columns], { reason, columns: na
 const STATE = [
 	["State of charge", (s) => percentText(s.soc)], ["±, two standard deviations", (s) => percentText(2 * s.soc_std, s.soc_std)], ["Stability margin", (s) => percentText(s.stability_margin)],
 	["Voltage", (s) => f.volts(s.voltage_v)], ["estimated", (s) => f.volts(s.voltage_estimate_v)], ["Current", (s) => f.amperes(s.current_a)], ["Power", (s) => f.watts(s.power_w)],
-	["Temperature", (s) => f.celsius(s.temperature_c)], ["Charge left", (s) => f.ampereHours(s.remaining_capacity_ah)], ["Energy left", (s) => f.wattHours(s.remaining_energy_wh)],
+	["Temperature", (s) => f.celsius(s.temperature_c)], ["Charge left to 0 %", (s) => f.ampereHours(s.remaining_capacity_ah)], ["Energy left to cut-off", (s) => f.wattHours(s.remaining_energy_wh)],
 	["Innovation", (s) => f.millivolts(s.innovation_v)],
 	["Energy out", (s) => (f.isNumber(s.energy_out_kwh) ? f.wattHours(1e3 * s.energy_out_kwh) : "")], ["Energy in", (s) => (f.isNumber(s.energy_in_kwh) ? f.wattHours(1e3 * s.energy_in_kwh) : "")],
 	["Cycles", (s) => f.digits(s.equivalent_cycles, 3)], ["Measured", (s) => (s.time ? f.when(new Date(s.time)) : "")],
