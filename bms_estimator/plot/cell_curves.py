@@ -208,7 +208,7 @@ def element(cell: CellModel, name: str, estimates: Mapping[str, Floats] | None =
     if limit > 0.0:
         ax.axvline(100.0 * limit, color=FAINT, linestyle="-.", linewidth=1.0, label="stability limit")
     ax.set(ylabel=label)
-    ax.legend()
+    ax.legend(loc="best")
     return ax
 
 
@@ -226,7 +226,7 @@ def rc_product(cell: CellModel, pair: str, estimates: Mapping[str, Floats] | Non
     estimated = None if estimates is None else over_soc(estimates, f"tau_{pair}_s", f"tau_{pair}_std_s")
     ax = _draw_over_soc(ax or new_axes(), curve, estimated, 1.0)
     ax.set(ylabel=label)
-    ax.legend()
+    ax.legend(loc="best")
     return ax
 
 
@@ -248,7 +248,7 @@ def ocv(cell: CellModel, soc: Floats | None = None, ocv_v: Floats | None = None,
     if soc is not None and ocv_v is not None:
         ax.plot(100.0 * soc, ocv_v, "o", color=COLORS[1], markersize=3.5, label="rests")
     ax.set(xlabel="SOC [%]", ylabel="open-circuit voltage [V]")
-    ax.legend()
+    ax.legend(loc="best")
     return ax
 
 
@@ -265,7 +265,7 @@ def ocv_residuals(cell: CellModel, soc: Floats, residual_v: Floats, *, ax: Any =
     std_v = ocv_std(cell)
     if std_v is not None:
         draw_band(ax, 100.0 * SOC_GRID, -2e3 * std_v, 2e3 * std_v, label=f"{BAND_LABEL} of the curve")
-        ax.legend()
+        ax.legend(loc="best")
     ax.axhline(0.0, color=FAINT, linewidth=0.8)
     ax.plot(100.0 * soc, 1e3 * residual_v, "o", color=COLORS[1], markersize=3.5)
     limit_mv = 1.3e3 * float(np.abs(residual_v).max(initial=1e-3))  # with a margin of 30 %

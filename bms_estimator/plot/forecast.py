@@ -22,7 +22,7 @@ def soc_ahead(curve: ForecastCurve, *, ax: Any = None) -> Any:
     draw_band(ax, ahead, 100.0 * curve.soc_p05, 100.0 * curve.soc_p95, label=INTERVAL_LABEL)
     ax.plot(ahead, 100.0 * curve.soc_p50, color=COLORS[0], label="SOC, median")
     ax.plot(ahead, 100.0 * curve.survival, color=COLORS[1], linestyle="--", label="probability of no cut-off yet")
-    ax.legend()
+    ax.legend(loc="best")
     return label_axes(ax, curve.elapsed_s, "SOC, probability [%]", MIN_SOC_SPAN_PERCENT)
 
 
@@ -39,5 +39,5 @@ def voltage_ahead(curve: ForecastCurve, cutoff_v: float, *, ax: Any = None) -> A
     draw_band(ax, ahead, curve.voltage_p05_v, curve.voltage_p95_v, color=COLORS[2], label=INTERVAL_LABEL)
     ax.plot(ahead, curve.voltage_p50_v, color=COLORS[2], label="voltage, median")
     ax.axhline(cutoff_v, color=FAINT, linewidth=0.8, label=f"cut-off {cutoff_v:.4g} V")
-    ax.legend()
+    ax.legend(loc="best")
     return label_axes(ax, curve.elapsed_s, "voltage [V]", MIN_VOLTAGE_SPAN_V)

@@ -32,7 +32,10 @@ from tests.patience import LONG_S
 from tests.scripted_source import Collector, ScriptedSource
 
 CELL = load_cell("chen_mora")
-SETTINGS = Settings.model_validate({"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}})
+SETTINGS = Settings.model_validate(
+    {"pack": {"initial_soc": 0.5}, "publish": {"rate_hz": 10.0}, "alarms": {"link_lost": {"limit_s": LONG_S}}}
+)
+"""Settings with a long limit of ``link_lost``, because most sources of the tests send only a few samples."""
 
 
 def edit_settings(section: str, **values: Any) -> Settings:

@@ -8,6 +8,7 @@ import pytest
 from bms_estimator.doctor.examine import Check, run_checks
 from bms_estimator.doctor.finding import Finding, Level, ok
 from bms_estimator.model.errors import UserError
+from tests.patience import LONG_S
 
 
 def succeed() -> Iterator[Finding]:
@@ -52,14 +53,20 @@ def test_a_check_that_raises_is_a_fault_and_the_others_run(error: Exception, tex
 
 
 def test_a_check_that_hangs_is_a_warning_and_the_others_run() -> None:
-    forever = threading.Event()
+    has_begun, forever = threading.Event(), threading.Event()
 
     def hang() -> Iterator[Finding]:
         yield ok("slow", "begun")
+        has_begun.set()
         forever.wait()
 
-    begun, hung, good = run_checks([Check("slow", hang, timeout_s=0.2), Check("good", succeed)])
+    begun, hung, good = run_checks(
+        [
+            Check("waits for the slow check", lambda: [] if has_begun.wait(LONG_S) else succeed(), timeout_s=LONG_S),
+            Check("slow", hang, timeout_s=0.2),
+            Check("good", succeed),
+        ]
+    )
     forever.set()
-    assert begun.text == "begun"
     assert (hung.check, hung.level, hung.text) == ("slow", Level.WARNING, "no result within 0.2 s")
-    assert good == ok("good", "fine")
+    assert (begun.text, good) == ("begun", ok("good", "fine"))

@@ -656,12 +656,12 @@ async def test_after_a_suspend_the_relay_stays_open_until_new_samples_are_watche
         await wait_until(lambda: board.levels)
         assert all(board.levels)
         board.levels.clear()
-        now_s = 100.0
+        now_s = 1000.0
         source.give(*((float(t), 0.0, 3.8, 25.0, 0) for t in range(12, 32)))
         await wait_until(lambda: board.levels)
-        for t in range(100, 120):
+        for t in range(1000, 1020):
             commands, now_s = len(board.levels), t + 1.0
-            source.give((float(t), 0.0, 3.8, 25.0 if t < 103 else 70.0, 0))
+            source.give((float(t), 0.0, 3.8, 25.0 if t < 1003 else 70.0, 0))
             await wait_until(lambda least=commands + 2: len(board.levels) >= least)
     assert by_name(sink.snapshots[-1].alarms)["over_temperature"].active
     assert not any(board.levels)

@@ -72,7 +72,7 @@ async def test_the_end_of_an_alarm_whose_message_was_denied_replaces_the_message
             (tmp_path / "acl").write_text("topic readwrite #\n")
             broker.reload()
             await wait_for_health(hooks, lambda health: (health.done, health.failing) == (1, []))
-            assert live.all("load/set") == [b"soc_low cleared"]
+            assert await live.wait("load/set") == b"soc_low cleared"
 
 
 @pytest.mark.parametrize("cycles", range(10))  # in one of them, the denied job is due while the last one waits

@@ -46,7 +46,7 @@ def figure_26(experiment: Experiment) -> Figure:
         axes[0].plot(grid, p.joint_fit(grid), color="black", linewidth=1.0, label="(2.10), joint fit")
         axes[0].plot(grid, p.table(grid), color=FAINT, linewidth=1.0, label="table")
         axes[0].set(xlabel="SOC", ylabel="E_o [V]")
-        axes[0].legend()
+        axes[0].legend(loc="best")
         for color, test in zip(np.resize(COLORS, len(p.tests)), p.tests, strict=True):
             axes[1].plot(test.soc, 1e3 * (test.ocv_v - p.joint_fit(test.soc)), "o", ms=3, color=color)
         axes[1].axhline(0.0, color=FAINT, linewidth=0.8)
@@ -135,7 +135,7 @@ def figure_31(experiment: Experiment) -> Figure:
         middle = 1e3 * float(np.median(p.r_s_mean.r_s_ohm))
         # sorted, because (4.2) can give a negative resistance
         axes.set(xlabel="SOC", ylabel="R_s [mΩ]", ylim=sorted((0.5 * middle, 1.5 * middle)))
-        axes.legend(ncols=2)
+        axes.legend(loc="best", ncols=2)
 
     return _figure(
         "31",
@@ -188,7 +188,7 @@ def _voltages(p: Procedure) -> Callable[[Any, str], None]:
         ax.plot(t, y, color=COLORS[0], alpha=0.45, linewidth=2.4, label="actual")
         ax.plot(t, yhat, "--", color=COLORS[1], label="estimated", linewidth=1.0)
         ax.set(xlabel="time [h]", ylabel="V")
-        ax.legend()
+        ax.legend(loc="best")
 
     return draw_load
 
@@ -253,7 +253,7 @@ def figure_41(experiment: Experiment) -> Figure:
         axes[0].plot(hours, counted, color=COLORS[0], alpha=0.45, linewidth=2.4, label="coulomb counting")
         axes[0].plot(hours, interpolated, "--", color=COLORS[1], linewidth=1.0, label="interpolation in E_o")
         axes[0].set(xlabel="time [h]", ylabel="SOC")
-        axes[0].legend()
+        axes[0].legend(loc="best")
         hours, difference = thin(run.time_s / 3600.0, 100.0 * (soc - run.soc))
         axes[1].plot(hours, difference, linewidth=0.9)
         axes[1].set(xlabel="time [h]", ylabel="% of SOC", title="interpolated minus counted")
@@ -279,7 +279,7 @@ def figure_42(experiment: Experiment) -> Figure:
         x, y = thin(soc, e_o)
         axes.plot(x, y, "--", color=COLORS[1], label="over interpolated SOC")
         axes.set(xlabel="SOC", ylabel="V")
-        axes.legend()
+        axes.legend(loc="best")
 
     return _figure("42", f"E_o over SOC, {p.largest_load}", plot(draw, salt="figure-42"), experiment, "")
 

@@ -29,7 +29,7 @@ def tracking_plot(run: AdaptiveRun, label: str) -> Callable[[Any], None]:
         axes.plot(t, y, label="y, true cell", linewidth=2.6, color=COLORS[0], alpha=0.45)
         axes.plot(t, yhat, "--", label=label, color=COLORS[1])
         axes.set(xlabel="time [min]", ylabel="V")
-        axes.legend()
+        axes.legend(loc="best")
 
     return draw
 
@@ -50,7 +50,7 @@ def frozen_plot(axes: Any, frozen: Prediction, label: str) -> None:
     axes.plot(t, y, label="y, true cell", linewidth=2.6, color=COLORS[0], alpha=0.45)
     axes.plot(t, yhat, "--", label=label, color=COLORS[1])
     axes.set(xlabel="time [min]", ylabel="V")
-    axes.legend()
+    axes.legend(loc="best")
 
 
 def crossing_plot(axes: Any, run: AdaptiveRun) -> None:
@@ -83,7 +83,7 @@ def elements_plot(axes: Any, true: Floats | None, estimated: Floats, crossing_so
         for crossing_soc, style in zip(crossing_socs, ("--", ":"), strict=True):
             ax.axvline(crossing_soc, color=FAINT, linestyle=style, linewidth=1.0)
         ax.set(xlabel="SOC", ylabel=unit, title=name, xlim=(0.0, 1.0))
-        ax.legend()
+        ax.legend(loc="best")
 
 
 def products_plot(axes: Any, true: Floats | None, estimated: Floats) -> None:
@@ -93,7 +93,7 @@ def products_plot(axes: Any, true: Floats | None, estimated: Floats) -> None:
             ax.plot(SOC_GRID, element(name, true), label="Chen and Mora")
         ax.plot(SOC_GRID, element(name, estimated), "--", label="estimated")
         ax.set(xlabel="SOC", ylabel="s", title=name.replace(" ", " · "))
-        ax.legend()
+        ax.legend(loc="best")
 
 
 def dynamic_static_plot(axes: Any, dynamic: Prediction, static: Prediction) -> None:
@@ -106,10 +106,10 @@ def dynamic_static_plot(axes: Any, dynamic: Prediction, static: Prediction) -> N
     axes[0].plot(t, dynamic_v, "--", color=COLORS[1], label="dynamic")
     axes[0].plot(t, static_v, ":", color=COLORS[2], label="static")
     axes[0].set(xlabel="time [min]", ylabel="V", title="SOC below 0.25")
-    axes[0].legend()
+    axes[0].legend(loc="best")
     for run, label, color in ((static, "static", COLORS[2]), (dynamic, "dynamic", COLORS[1])):
         soc, e = thin(run.soc, 1e3 * run.error_v)
         axes[1].plot(soc, e, color=color, label=label, linewidth=1.0)
     axes[1].set(xlabel="SOC", ylabel="error [mV]", title="actual minus model")
     axes[1].invert_xaxis()
-    axes[1].legend()
+    axes[1].legend(loc="best")

@@ -87,7 +87,7 @@ def figure_10(_: Simulation) -> Figure:
         axes.axhline(0.0, color=FAINT, linewidth=0.8)
         axes.set(xlabel="k", ylabel="N(k)", xlim=(0.0, 14.0))
         axes.set_yscale("symlog", linthresh=1.0)
-        axes.legend()
+        axes.legend(loc="best")
 
     return Figure(
         "10",
@@ -220,7 +220,7 @@ def figure_22(s: Simulation) -> Figure:
         axes.plot(SOC_GRID, s.r_s_fit(SOC_GRID), "k--", label="fit of the mean")
         axes.plot(SOC_GRID, [r_s(x, s.cell.a) for x in SOC_GRID], color=FAINT, linewidth=2.4, label="Chen and Mora")
         axes.set(xlabel="SOC", ylabel="R_s [Ω]", ylim=(0.0, 0.15))
-        axes.legend(ncols=2)
+        axes.legend(loc="best", ncols=2)
 
     return Figure(
         "22",
@@ -244,12 +244,12 @@ def figure_23(s: Simulation) -> Figure:
         frozen_plot(axes[0], as_printed, "estimated model, Tables 5 and 6")
         t, run = thin(s.improved.time_s / 600.0, s.improved.voltage_estimate_v)
         axes[0].plot(t, run, ":", color=COLORS[2], label="run time (C/10, time / 10)")
-        axes[0].legend()
+        axes[0].legend(loc="best")
         for label, prediction in runs.items():
             t, e = thin(prediction.time_s / 60.0, 1e3 * prediction.error_v)
             axes[1].plot(t, e, label=label)
         axes[1].set(xlabel="time [min]", ylabel="mV", title="true minus estimated")
-        axes[1].legend()
+        axes[1].legend(loc="best")
 
     return Figure(
         "23",
@@ -288,7 +288,7 @@ def figure_43(s: Simulation) -> Figure:
             axes.axvline(drawn, color=FAINT, linestyle="--", label="located dip" if drawn == dips[0] else None)
         axes.axvline(bank.drawn_at_warning, color=COLORS[2], linestyle=":", label="warning")
         axes.set(xlabel="charge drawn, in capacities of one battery", ylabel="E_o of the bank [V]")
-        axes.legend()
+        axes.legend(loc="best")
 
     located = " and ".join(f"{drawn:.2f}" for drawn in dips)
     return Figure(

@@ -66,19 +66,21 @@ async def url(request: pytest.FixtureRequest, broker: Broker) -> AsyncIterator[s
 
 
 async def test_topics_and_retained_flags_are_as_documented(broker: Broker, url: str) -> None:
-    async with Listener(broker) as live, Sink(url) as sink:
-        sink.mqtt.publish(CELL_SNAPSHOT)
-        await live.wait("bms/pack/home_assistant")  # is published last
-        async with Listener(broker) as late:
-            for topic in RETAINED_TOPICS:
-                await late.wait(f"bms/pack/{topic}")
-            await late.wait(DISCOVERY_TOPIC)
-            retained_topics = {name for name, _, retain in late.messages if retain}
+    async with Listener(broker) as live:
+        async with Sink(url) as sink:
+            sink.mqtt.publish(CELL_SNAPSHOT)
+            await live.wait("bms/pack/home_assistant")  # is published last
+            async with Listener(broker) as late:
+                for topic in RETAINED_TOPICS:
+                    await late.wait(f"bms/pack/{topic}")
+                await late.wait(DISCOVERY_TOPIC)
+                retained_topics = {name for name, _, retain in late.messages if retain}
+        await live.wait("bms/pack/availability", lambda payload: payload == b"offline")
     assert retained_topics == {f"bms/pack/{topic}" for topic in RETAINED_TOPICS} | {DISCOVERY_TOPIC}
-    assert live.all("bms/pack/availability") == [b"online", b"offline"]
-    assert live.all("bms/pack/sensor/availability") == [b"online", b"offline"]
-    topics = {name for name, _, _ in live.messages}
-    assert {"bms/pack/state", "bms/pack/parameters", "bms/pack/home_assistant"} <= topics
+    assert live.all("bms/pack/availability") == live.all("bms/pack/sensor/availability") == [b"online", b"offline"]
+    assert {f"bms/pack/{topic}" for topic in ("state", "parameters", "home_assistant")} <= {
+        name for name, _, _ in live.messages
+    }
     assert sink.delivery == DeliveryStats()
 
 

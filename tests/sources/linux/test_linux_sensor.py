@@ -22,10 +22,10 @@ UNREADABLE_FILE = Path("/proc/self/mem")
 """File whose beginning gives an input/output error when it is read."""
 
 
-def sensor(root: Path, **settings: Any) -> LinuxSensor:
+def sensor(root: Path, read_timeout_s: float = LONG_S, **settings: Any) -> LinuxSensor:
     """Return a sensor in the simulated /sys ``root``, polled every 10 ms."""
     return LinuxSensor(
-        LinuxSource.model_validate({"kind": "linux", "interval_s": 0.01} | settings), root, read_timeout_s=0.05
+        LinuxSource.model_validate({"kind": "linux", "interval_s": 0.01} | settings), root, read_timeout_s
     )
 
 
@@ -151,7 +151,7 @@ async def test_hung_bus_is_reported_and_not_read_by_a_second_thread_until_it_ans
     folder = hwmon(tmp_path, **INA226)
     (folder / "curr1_input").unlink()
     os.mkfifo(folder / "curr1_input")  # opening a FIFO blocks until another process opens it for writing
-    ina = sensor(tmp_path)
+    ina = sensor(tmp_path, read_timeout_s=0.05)
     threads_before = set(threading.enumerate())
     for _ in range(3):
         with pytest.raises(SourceUnavailableError, match=r"the bus has not answered for 0.05 s"):

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import tty
+from types import SimpleNamespace
 
 import pytest
 
@@ -71,13 +72,15 @@ def test_newer_jk_is_not_detected_because_its_request_is_a_modbus_write(
 
 
 def test_silent_device_receives_only_read_requests(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", 0.3)
-    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(device_detection, "PROTOCOL_TIMEOUT_S", 3.0)
+    monkeypatch.setattr(device_detection, "BOOT_TIMEOUT_S", 1.0)
+    # this clock advances by 1 s at each read, so that a delay of the test skips no request
+    monkeypatch.setattr(device_detection, "time", SimpleNamespace(monotonic=iter(range(1000)).__next__))
     master, slave = os.openpty()
     tty.setraw(slave)
     try:
         assert device_detection.probe(os.ttyname(slave)) == "silent"
-        sent = os.read(master, 1 << 16)
+        sent = other_bytes = os.read(master, 1 << 16)
     finally:
         os.close(slave)
         os.close(master)
@@ -89,7 +92,6 @@ def test_silent_device_receives_only_read_requests(monkeypatch: pytest.MonkeyPat
         *(jbd.request(register) for register in (jbd.NAME, jbd.CELLS, jbd.BASIC)),
         *(daly.request(host, command) for host in daly.HOSTS for command in (daly.STATUS, daly.CELLS, daly.PACK)),
     ]
-    other_bytes = sent
     for request in read_requests:
         other_bytes = other_bytes.replace(request, b"")
     assert other_bytes == b""
