@@ -6,6 +6,7 @@ of a running service reports denied topics and missing samples.
 """
 
 import asyncio
+import contextlib
 import json
 import secrets
 from collections.abc import AsyncIterator, Iterator
@@ -29,8 +30,9 @@ from bms_estimator.settings.connections import BrokerSettings
 from bms_estimator.sinks.mqtt.messages import AVAILABILITY
 
 NAME = "broker"
-RETAINED_TIMEOUT_S = 0.5
-"""Time within which a broker sends retained messages after a subscription [s]."""
+RETAINED_TIMEOUT_S = 2.0
+"""Time within which a broker sends retained messages after a subscription [s]. If ``online`` of a running service arrived
+later, the check would publish ``offline`` to its subscribers."""
 ECHO_TIMEOUT_S = 2.0
 """Time within which a broker returns a message [s]."""
 TIMEOUTS = Timeouts(connect_s=4.0, acknowledge_s=3.0)
@@ -112,7 +114,7 @@ async def _examine_rights(connection: Connection, pack_topic: str, silence_remed
     denied.pop(f"{pack_topic}/health", None)  # the service itself need not read it
     for name, reason in denied.items():
         yield fault(NAME, f"may not read {name}: {reason}", ACCESS_LIST_REMEDY)
-    retained = await _retained_messages(connection)
+    retained = await _retained_messages(connection, {topic, f"{pack_topic}/health"})
     if retained.get(topic) == b"online":
         for finding in _health_of_service(retained.get(f"{pack_topic}/health", b""), silence_remedy):
             yield finding
@@ -126,16 +128,15 @@ async def _examine_rights(connection: Connection, pack_topic: str, silence_remed
         yield ok(NAME, f"may write and read {topic}, and read {pack_topic}/request/+")
 
 
-async def _retained_messages(connection: Connection) -> dict[str, bytes]:
-    """Return the payloads of retained messages by topic."""
+async def _retained_messages(connection: Connection, topics: set[str]) -> dict[str, bytes]:
+    """Return the payloads of the retained messages of ``topics``."""
     retained = dict[str, bytes]()
-    try:
+    with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(RETAINED_TIMEOUT_S):
-            while True:
+            while not topics <= retained.keys():
                 message = await connection.receive()
                 retained[message.topic] = message.payload
-    except TimeoutError:
-        return retained
+    return retained
 
 
 async def _is_echoed(connection: Connection, topic: str) -> bool:
