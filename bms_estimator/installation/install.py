@@ -12,6 +12,8 @@ from bms_estimator.installation import paths
 from bms_estimator.installation.machine import Machine, read_file, run, tree
 from bms_estimator.installation.program_copy import is_program_copy
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.state_folder import lock_holder
+from bms_estimator.settings.pack import Settings
 
 FILES = Path(__file__).parent / "files"
 """Folder with the original files."""
@@ -58,8 +60,12 @@ def system_files(machine: Machine, program: Path) -> list[SystemFile]:
     return files
 
 
+USER_STATE = ".local/state/bms-estimator"
+"""Folder in a home folder with the state of packs that its user runs without the service."""
 UDEV_CONTROL = Path("/run/udev/control")
 """Socket of udev, which does not run in containers."""
+NOT_STARTED = " under systemd; systemd does not run here, so it is not started now"
+"""Addition to the report of the enabled service on a machine without systemd, such as a container."""
 OTHER_UNITS = f"{paths.NAME}@*.service"
 """Pattern of the units of other packs."""
 Report = Callable[[str, str], None]
@@ -113,8 +119,29 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
     if not machine.path(paths.PACK_FILE).exists() or (is_upgrade and pack is None and not _is_enabled(machine)):
         return False
     machine.run("systemctl", "enable", "--quiet", paths.UNIT.name)
-    report("service", "enabled: it starts with the machine")
+    report("service", f"enabled: it starts with the machine{NOT_STARTED if machine.lacks_systemd else ''}")
     return True
+
+
+def require_stopped(settings: Settings, home: Path, start_command: str) -> None:
+    """Check that no process outside systemd serves a pack, because a second one would fail or publish to the same topics.
+
+    Args:
+        settings: Settings of the pack.
+        home: Home folder of the user who may have run the pack.
+        start_command: Command that starts the pack afterwards.
+
+    Raises:
+        UserError: A process serves the pack. The message contains the commands that stop it and start the service.
+    """
+    name = settings.pack.name
+    for folder in [settings.state.folder] if settings.state.folder else [home / USER_STATE, paths.STATE]:
+        process = lock_holder(folder.expanduser(), name)
+        if process and f"/{paths.NAME}" not in Path(f"/proc/{process}/cgroup").read_text(encoding="utf-8"):
+            raise UserError(
+                f"{name}: process {process} runs this pack by hand, so that the service is installed but not started; "
+                f"stop the process, then start the service:\n  sudo kill {process}\n  sudo {start_command}"
+            )
 
 
 def compile_ahead(program: Path) -> None:

@@ -48,6 +48,11 @@ class Machine:
         """True if systemd runs this machine, so that a service can be started."""
         return self.root == Path("/") and Path("/run/systemd/system").is_dir()
 
+    @property
+    def lacks_systemd(self) -> bool:
+        """True for this machine if systemd does not run it, as in a container; False for a system image."""
+        return self.root == Path("/") and not self.has_running_systemd
+
     def run(self, program: str, *arguments: str, root_option: str = "--root") -> None:
         """Run a program that changes the machine.
 

@@ -121,7 +121,8 @@ def watch_events(alarms: Iterable[Alarm]) -> Iterator[EventText]:
 
 def _gap_event(gap_s: float) -> Iterator[EventText]:
     if gap_s >= MIN_UNSEEN_S:
-        yield EventText("unseen", f"no measurements for {gap_s:.1f} s")
+        # after a kill, the estimate also lacks the samples since the last checkpoint, which did arrive
+        yield EventText("unseen", f"the estimate has no measurements of the last {gap_s:.1f} s")
 
 
 def _sensor_events(previous: Health | None, health: Health) -> Iterator[EventText]:

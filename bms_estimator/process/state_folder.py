@@ -138,6 +138,16 @@ def is_locked(folder: Path, pack: str) -> bool:
     return False
 
 
+def lock_holder(folder: Path, pack: str) -> int | None:
+    """Return the process that holds the lock of a pack; None if no process holds it, or if it is unknown.
+
+    Each call leaves a connection in the short queue of the holder, so that later calls may not learn the process.
+    """
+    with contextlib.suppress(OSError):
+        return _find_holder(_socket_name(folder, pack))[0]
+    return None
+
+
 def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
     """Bind the name of the lock, unless a service has it.
 

@@ -54,6 +54,8 @@ FORECAST_INTERVAL_S = 60.0
 """Minimum interval between two payloads of the forecast's curves [s]."""
 CELLS_INTERVAL_S = 60.0
 """Minimum interval between two comparisons of the cells [s]."""
+DROP_LOG_INTERVAL_S = 300.0
+"""Minimum interval between two log lines on samples out of range [s]. The first one is logged at once."""
 SOURCE_HUNG_S = 20.0
 """Time after which a source whose task has not run counts as hung [s]. A missing port is retried at least every 10 s."""
 
@@ -112,6 +114,7 @@ class Publisher:
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._last_sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
+        self._drop_logged_s = -math.inf
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
         self._dropped_before = self._dropped_counts()  # by kind, when the last sample was accepted
         self.latest: Estimate | None = None
@@ -155,6 +158,9 @@ class Publisher:
         self._device_soc = finite(received.device_soc[-1]) if received.device_soc.size else None
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
+            if self._drop_reason and now_s - self._drop_logged_s >= DROP_LOG_INTERVAL_S:
+                self._drop_logged_s = now_s
+                log.warning("samples are dropped", reason=self._drop_reason)
         elif self._drop_reason is not None:
             self._drop_reason, self._dropped_before = None, self._dropped_counts()
         if now_s < self._due_s or not self.latest:

@@ -566,8 +566,14 @@ def test_limits_depend_on_chemistry_size_and_settings() -> None:
     lfp = {alarm.name: alarm for alarm in monitored_alarms(settings(), lfp_pack)}
     assert (lfp["pack_over_voltage"].limit, lfp["pack_over_voltage"].clear) == pytest.approx((58.4, 54.4))
     assert (lfp["discharge_over_current"].limit, lfp["charge_over_current"].limit) == (1000.0, 200.0)
-    limits = {"pack_over_voltage": {"limit_v": 57.6}, "cell_imbalance": {"enabled": False}}
-    configured = {alarm.name: alarm for alarm in monitored_alarms(settings(limits), lfp_pack)}
+    limits = {
+        "pack_over_voltage": {"limit_v": 57.6},
+        "cell_imbalance": {"enabled": False},
+        "charge_over_current": {"limit_a": 120.0},
+    }
+    rated = settings(limits, pack={"max_discharge_a": 150.0, "max_charge_a": 90.0})
+    configured = {alarm.name: alarm for alarm in monitored_alarms(rated, lfp_pack)}
+    assert (configured["discharge_over_current"].limit, configured["charge_over_current"].limit) == (150.0, 120.0)
     assert configured["pack_over_voltage"].clear == pytest.approx(53.6)
     assert configured["pack_over_voltage"].latch
     assert "cell_imbalance" not in configured

@@ -56,11 +56,8 @@ def build_screen(view: ViewState, width: int) -> RenderableType:
     lines: list[RenderableType] = [table, *messages[:MAX_MESSAGES]]
     if len(messages) > MAX_MESSAGES:
         lines.append(Text(f"alarms and faults not shown: {len(messages) - MAX_MESSAGES}", style=URGENT_STYLE))
-    for entry in view.log[-LOG_LINES:]:
-        line = Text.from_ansi(entry)
-        line.no_wrap, line.overflow = True, "ellipsis"
-        lines.append(line)
-    return Group(*lines, Text(view.hint, style="cyan"))
+    log_lines = map(Text.from_ansi, view.log[-LOG_LINES:])
+    return Group(*lines, *log_lines, Text(view.hint, style="cyan"))
 
 
 def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:

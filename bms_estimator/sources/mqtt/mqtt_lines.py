@@ -127,6 +127,7 @@ class MqttProducer(LineProducer):
                     self._assembler.add_message(
                         message.topic, message.payload, self._monotonic(), retained=message.retain
                     )
+                    self.first_invalid = self._assembler.first_faults.get("no_number", "")
                     self._log_conflict()
                     self._log_faults()
                 if line := self._assembler.line(self._monotonic()):

@@ -83,6 +83,7 @@ class SampleAssembler:
 
     Attributes:
         faults: Latest error of each quantity without a value in its last message, by name of the quantity.
+        first_faults: First error of each kind, with quantity and topic, by name of its counter.
     """
 
     def __init__(self, settings: MqttSource) -> None:
@@ -110,6 +111,7 @@ class SampleAssembler:
         self._values: dict[_Key, _StoredValue] = {}
         self._irregular = set[tuple[str, int]]()  # quantities and indices of locations that a message lacked
         self.faults: dict[str, str] = {}
+        self.first_faults: dict[str, str] = {}
         self._unused_arrival_s: dict[str, float] = {}  # arrival times of voltage and current since the last sample
         self._repeat_s = math.inf  # time at which the last current is used again
         self._counters = dict.fromkeys(("retained", "missing", "no_number", "stale", "publisher_errors"), 0)
@@ -214,6 +216,7 @@ class SampleAssembler:
                 self._set_absent(location, keys, is_null=not isinstance(error, MissingError))
                 self._counters[error.counter] += 1
                 self.faults[binding.quantity] = f"{binding.quantity}: {topic}: {error}"
+                self.first_faults.setdefault(error.counter, self.faults[binding.quantity])
             else:
                 self.faults.pop(binding.quantity, None)
                 has_conflict |= self._update_conflict(binding, now_s)

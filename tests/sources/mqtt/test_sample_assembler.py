@@ -432,6 +432,7 @@ def test_invalid_payload_is_counted_and_reported(payload: str, counter: str, rea
     assert assembler.counters[counter] >= 1
     assert reason in (assembler.fault or "")
     assert feed(assembler, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    assert reason in assembler.first_faults[counter]  # also after valid values
 
 
 @given(st.binary() | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode))
