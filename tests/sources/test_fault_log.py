@@ -33,8 +33,11 @@ def test_a_reason_that_samples_interrupt_is_logged_at_intervals() -> None:
 
 
 def test_reasons_that_always_differ_are_logged_at_intervals() -> None:
-    reasons = [f"noise {number}" for number in range(1000)]
-    assert MAX_REASONS < len(logged_reasons(SilenceLog(), reasons)) <= MAX_REASONS + 1000 / MIN_LOG_INTERVAL_S
+    assert (
+        MAX_REASONS
+        < len(logged_reasons(SilenceLog(), [f"noise {number}" for number in range(1000)]))
+        <= MAX_REASONS + 1000 / MIN_LOG_INTERVAL_S
+    )
 
 
 def test_normal_events_are_not_logged_as_faults() -> None:

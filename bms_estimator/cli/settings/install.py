@@ -67,8 +67,11 @@ def install_command(
         may_start = install(machine, program, files, _report)
     hand_command = f"{program} run {paths.PACK_FILE}"
     if may_start and machine.root == Path("/") and not no_start:
-        start_command = hand_command if machine.lacks_systemd else f"systemctl restart {paths.NAME}"
-        require_stopped(load_settings(paths.PACK_FILE), _user_home(), start_command)
+        require_stopped(
+            load_settings(paths.PACK_FILE),
+            _user_home(),
+            (hand_command if machine.lacks_systemd else f"systemctl restart {paths.NAME}"),
+        )
     if machine.has_running_systemd and not no_start:
         if may_start:
             compile_ahead(program)
@@ -105,8 +108,7 @@ def uninstall_command(
     program, has_settings = _own_path(), machine.path(paths.PACK_FILE).exists()
     with _errors_of_files():
         remaining = uninstall(machine, purge=purge, report=_report)
-    user_folders = (_user_home() / name for name in USER_FOLDERS)
-    remaining += [path for path in user_folders if machine.path(path).exists()]
+    remaining += [path for path in (_user_home() / name for name in USER_FOLDERS) if machine.path(path).exists()]
     if program.exists():
         remaining.append(program)
     if has_settings:

@@ -52,12 +52,13 @@ def build_screen(view: ViewState, width: int) -> RenderableType:
     """Return the screen for a terminal of ``width`` cells."""
     messages = [] if view.pack is None else _messages(view.pack)
     messages.sort(key=lambda message: message.style != URGENT_STYLE)
-    table = "nothing has been published yet" if view.pack is None else _pack_table(view, view.pack, width)
-    lines: list[RenderableType] = [table, *messages[:MAX_MESSAGES]]
+    lines: list[RenderableType] = [
+        ("nothing has been published yet" if view.pack is None else _pack_table(view, view.pack, width)),
+        *messages[:MAX_MESSAGES],
+    ]
     if len(messages) > MAX_MESSAGES:
         lines.append(Text(f"alarms and faults not shown: {len(messages) - MAX_MESSAGES}", style=URGENT_STYLE))
-    log_lines = map(Text.from_ansi, view.log[-LOG_LINES:])
-    return Group(*lines, *log_lines, Text(view.hint, style="cyan"))
+    return Group(*lines, *map(Text.from_ansi, view.log[-LOG_LINES:]), Text(view.hint, style="cyan"))
 
 
 def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:
@@ -69,8 +70,14 @@ def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:
         table.add_column("True\nSOC %", no_wrap=True, style="magenta")
     table.add_column(f"State at\n{clock_text(view.now_s)}", no_wrap=True)
     is_wide = width >= MIN_WIDE_TABLE_CELLS
-    remaining = ("Remaining\nAh",) if is_wide else ()
-    for heading in ("Voltage\nV", "Current\nA", "Power\nW", *remaining, "To cut-off\nh, 90 %", "Innovation\nmV"):
+    for heading in (
+        "Voltage\nV",
+        "Current\nA",
+        "Power\nW",
+        *(("Remaining\nAh",) if is_wide else ()),
+        "To cut-off\nh, 90 %",
+        "Innovation\nmV",
+    ):
         table.add_column(heading, justify="right", no_wrap=True)
     state, is_stale = pack.fields("state"), pack.stale_since() is not None
     table.add_row(
@@ -219,8 +226,13 @@ class LiveView:
 
     def _present_state(self) -> ViewState:
         """Return a copy, because the drawing thread must not see changes."""
-        packs = (PackView(name, dict(device.topics)) for name, device in self._devices.items())
-        return ViewState(self._wall(), next(packs, None), tuple(self._log), self._hint, self._true_soc())
+        return ViewState(
+            self._wall(),
+            next((PackView(name, dict(device.topics)) for name, device in self._devices.items()), None),
+            tuple(self._log),
+            self._hint,
+            self._true_soc(),
+        )
 
     def _run_thread(self) -> None:
         try:
