@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import tomllib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from bms_estimator.installation import paths
 from bms_estimator.installation.machine import Machine, read_file, run, tree
 from bms_estimator.installation.program_copy import is_program_copy
 from bms_estimator.model.errors import UserError
+from bms_estimator.process.state_folder import lock_holder
+from bms_estimator.settings.pack import Settings
 
 FILES = Path(__file__).parent / "files"
 """Folder with the original files."""
@@ -45,21 +48,26 @@ def system_files(machine: Machine, program: Path) -> list[SystemFile]:
     """
     unit = (FILES / "bms-estimator.service").read_text(encoding="utf-8").replace(UNIT_PROGRAM, str(program))
     template = unit.replace(str(paths.PACK_FILE), f"{paths.SETTINGS}/%i.toml")
-    rule = (FILES / "99-bms-estimator.rules").read_text(encoding="utf-8")
     files = [
         SystemFile("unit", paths.UNIT, unit),
         SystemFile("unit", paths.TEMPLATE, template),
-        SystemFile("udev rule", paths.UDEV_RULE, rule),
+        SystemFile("udev rule", paths.UDEV_RULE, (FILES / "99-bms-estimator.rules").read_text(encoding="utf-8")),
     ]
     # where these daemons set the clock, the drop-in allows the service to ask the kernel whether it is synchronized
     if any(machine.path(daemon).exists() for daemon in paths.CLOCK_DAEMONS):
-        drop_in = (FILES / "clock.conf").read_text(encoding="utf-8")
-        files += [SystemFile("unit", paths.clock_drop_in(unit), drop_in) for unit in (paths.UNIT, paths.TEMPLATE)]
+        files += [
+            SystemFile("unit", paths.clock_drop_in(unit), (FILES / "clock.conf").read_text(encoding="utf-8"))
+            for unit in (paths.UNIT, paths.TEMPLATE)
+        ]
     return files
 
 
+USER_STATE = ".local/state/bms-estimator"
+"""Folder in a home folder with the state of packs that its user runs without the service."""
 UDEV_CONTROL = Path("/run/udev/control")
 """Socket of udev, which does not run in containers."""
+NOT_STARTED = " under systemd; systemd does not run here, so it is not started now"
+"""Addition to the report of the enabled service on a machine without systemd, such as a container."""
 OTHER_UNITS = f"{paths.NAME}@*.service"
 """Pattern of the units of other packs."""
 Report = Callable[[str, str], None]
@@ -113,8 +121,29 @@ def install(machine: Machine, program: Path, pack: PackFiles | None, report: Rep
     if not machine.path(paths.PACK_FILE).exists() or (is_upgrade and pack is None and not _is_enabled(machine)):
         return False
     machine.run("systemctl", "enable", "--quiet", paths.UNIT.name)
-    report("service", "enabled: it starts with the machine")
+    report("service", f"enabled: it starts with the machine{NOT_STARTED if machine.lacks_systemd else ''}")
     return True
+
+
+def require_stopped(settings: Settings, home: Path, start_command: str) -> None:
+    """Check that no process outside systemd serves a pack, because a second one would fail or publish to the same topics.
+
+    Args:
+        settings: Settings of the pack.
+        home: Home folder of the user who may have run the pack.
+        start_command: Command that starts the pack afterwards.
+
+    Raises:
+        UserError: A process serves the pack. The message contains the commands that stop it and start the service.
+    """
+    name = settings.pack.name
+    for folder in [settings.state.folder] if settings.state.folder else [home / USER_STATE, paths.STATE]:
+        process = lock_holder(folder.expanduser(), name)
+        if process and f"/{paths.NAME}" not in Path(f"/proc/{process}/cgroup").read_text(encoding="utf-8"):
+            raise UserError(
+                f"{name}: process {process} runs this pack by hand, so that the service is installed but not started; "
+                f"stop the process, then start the service:\n  sudo kill {process}\n  sudo {start_command}"
+            )
 
 
 def compile_ahead(program: Path) -> None:
@@ -165,8 +194,7 @@ def reload_system() -> None:
 
 def _link_program(machine: Machine, program: Path, report: Report) -> None:
     """Link the program from the search path of root, unless a program of this name is there."""
-    folders = [machine.path(folder) for folder in paths.SEARCH_PATH.split(":")]
-    if any((folder / paths.NAME).exists() for folder in folders):
+    if any((folder / paths.NAME).exists() for folder in map(machine.path, paths.SEARCH_PATH.split(":"))):
         return
     link = machine.path(paths.PROGRAM_LINK)
     link.parent.mkdir(parents=True, exist_ok=True)
@@ -227,8 +255,7 @@ def _set_settings_group(machine: Machine, group: int) -> None:
 
 
 def _is_enabled(machine: Machine) -> bool:
-    folders = machine.path(paths.UNIT).parent.glob("*.wants")
-    return any((folder / paths.UNIT.name).is_symlink() for folder in folders)
+    return any((folder / paths.UNIT.name).is_symlink() for folder in machine.path(paths.UNIT).parent.glob("*.wants"))
 
 
 def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
@@ -259,7 +286,8 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
     for name in user_data if purge else ():
         _remove(machine, name, report)
     for folder in drop_ins:
-        _remove_if_empty(machine.path(folder))
+        with suppress(OSError):  # it is absent, or has files of the user
+            machine.path(folder).rmdir()
     if machine.has_running_systemd:
         reload_system()
     for name in user_data:
@@ -292,11 +320,6 @@ def _remove_user(machine: Machine, report: Report) -> None:
     if machine.group_id(paths.NAME) is not None:
         machine.run("groupdel", paths.NAME, root_option="--prefix")
     report("removed", f"user {paths.NAME}")
-
-
-def _remove_if_empty(folder: Path) -> None:
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
 
 
 def _give_to_root(folder: Path) -> None:

@@ -14,8 +14,7 @@ from bms_estimator.model.errors import UserError
 
 def root_command(*arguments: str | Path) -> list[str]:
     """Return the command that runs this program as root, with its full path, because sudo does not search a virtual environment."""
-    program = Path(sys.executable).with_name(paths.NAME)
-    return ["sudo", str(program), *map(str, arguments)]
+    return ["sudo", str(Path(sys.executable).with_name(paths.NAME)), *map(str, arguments)]
 
 
 _LINK_ERROR = "{}: is a symbolic link, which may lead to another user's file; replace it with the file"
@@ -47,6 +46,11 @@ class Machine:
     def has_running_systemd(self) -> bool:
         """True if systemd runs this machine, so that a service can be started."""
         return self.root == Path("/") and Path("/run/systemd/system").is_dir()
+
+    @property
+    def lacks_systemd(self) -> bool:
+        """True for this machine if systemd does not run it, as in a container; False for a system image."""
+        return self.root == Path("/") and not self.has_running_systemd
 
     def run(self, program: str, *arguments: str, root_option: str = "--root") -> None:
         """Run a program that changes the machine.

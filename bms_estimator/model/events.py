@@ -69,17 +69,23 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
     """
     health = snapshot.health
     if before is None:
-        started = EventText("start", f"checkpoint: {health.checkpoint}")
         # at the start ``health.unseen_s`` is the gap between the runs; None: no gap, or an unknown length
-        texts = [started, *_gap_event(health.unseen_s or 0.0), *_sensor_events(None, health)]
+        texts = [
+            EventText("start", f"checkpoint: {health.checkpoint}"),
+            *_gap_event(health.unseen_s or 0.0),
+            *_sensor_events(None, health),
+        ]
         texts += [*input_fault_events([], health.suspects), *_checkpoint_events("", health)]
     elif before.health is health:
         texts = []
     else:
         previous = before.health
         # the total counts all gaps since the previous snapshot; ``health.unseen_s`` is only the last gap
-        gaps = _gap_event(health.total.unseen_s - previous.total.unseen_s)
-        texts = [*gaps, *_sensor_events(previous, health), *input_fault_events(previous.suspects, health.suspects)]
+        texts = [
+            *_gap_event(health.total.unseen_s - previous.total.unseen_s),
+            *_sensor_events(previous, health),
+            *input_fault_events(previous.suspects, health.suspects),
+        ]
         texts += _checkpoint_events(previous.checkpoint, health)
         texts += soc_events(previous.identifier, health.identifier, health.anchor)
         texts += _fit_events(previous, health)
@@ -121,7 +127,8 @@ def watch_events(alarms: Iterable[Alarm]) -> Iterator[EventText]:
 
 def _gap_event(gap_s: float) -> Iterator[EventText]:
     if gap_s >= MIN_UNSEEN_S:
-        yield EventText("unseen", f"no measurements for {gap_s:.1f} s")
+        # after a kill, the estimate also lacks the samples since the last checkpoint, which did arrive
+        yield EventText("unseen", f"the estimate has no measurements of the last {gap_s:.1f} s")
 
 
 def _sensor_events(previous: Health | None, health: Health) -> Iterator[EventText]:

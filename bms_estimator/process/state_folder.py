@@ -57,7 +57,7 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
     """
     new_path = path.with_suffix(".new")
     new_path.unlink(missing_ok=True)  # a power failure may have left it, or it is an unexpected symbolic link
-    with open(new_path, "xb", opener=_open_private) as file:
+    with open(new_path, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
         if os.geteuid() == 0:
             owner = path.parent.stat()
             os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
@@ -83,10 +83,6 @@ def overwrite_private(path: Path, content: bytes) -> None:
         file.truncate()
         file.flush()
         os.fsync(file.fileno())
-
-
-def _open_private(path: str, flags: int) -> int:
-    return os.open(path, flags, 0o600)
 
 
 ROOT_USER = 0
@@ -138,6 +134,16 @@ def is_locked(folder: Path, pack: str) -> bool:
     return False
 
 
+def lock_holder(folder: Path, pack: str) -> int | None:
+    """Return the process that holds the lock of a pack; None if no process holds it, or if it is unknown.
+
+    Each call leaves a connection in the short queue of the holder, so that later calls may not learn the process.
+    """
+    with contextlib.suppress(OSError):
+        return _find_holder(_socket_name(folder, pack))[0]
+    return None
+
+
 def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
     """Bind the name of the lock, unless a service has it.
 
@@ -175,8 +181,7 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
 
 def _socket_name(folder: Path, pack: str) -> str:
     """Return the name of the lock, a hash within the length limit of socket names."""
-    real_folder = os.path.realpath(folder)
-    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{real_folder}/{pack}')).hexdigest()[:32]}"
+    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{os.path.realpath(folder)}/{pack}')).hexdigest()[:32]}"
 
 
 def _find_holder(name: str) -> tuple[int, int]:

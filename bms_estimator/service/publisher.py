@@ -54,6 +54,8 @@ FORECAST_INTERVAL_S = 60.0
 """Minimum interval between two payloads of the forecast's curves [s]."""
 CELLS_INTERVAL_S = 60.0
 """Minimum interval between two comparisons of the cells [s]."""
+DROP_LOG_INTERVAL_S = 300.0
+"""Minimum interval between two log lines on samples out of range [s]. The first one is logged at once."""
 SOURCE_HUNG_S = 20.0
 """Time after which a source whose task has not run counts as hung [s]. A missing port is retried at least every 10 s."""
 
@@ -112,6 +114,7 @@ class Publisher:
         self._started_s, self._started_wall_s = clock.monotonic(), clock.wall()
         self._due_s = self._started_s
         self._last_sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
+        self._drop_logged_s = -math.inf
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
         self._dropped_before = self._dropped_counts()  # by kind, when the last sample was accepted
         self.latest: Estimate | None = None
@@ -119,8 +122,9 @@ class Publisher:
 
     def set_rate(self, rate_hz: float) -> None:
         """Set the publish rate from the next publication on [1/s]."""
-        publish = self._settings.publish.model_copy(update={"rate_hz": rate_hz})
-        self._settings = self._settings.model_copy(update={"publish": publish})
+        self._settings = self._settings.model_copy(
+            update={"publish": self._settings.publish.model_copy(update={"rate_hz": rate_hz})}
+        )
         self.period_s = 1.0 / rate_hz
         self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sensor.sample_period_s)
 
@@ -155,6 +159,9 @@ class Publisher:
         self._device_soc = finite(received.device_soc[-1]) if received.device_soc.size else None
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
+            if self._drop_reason and now_s - self._drop_logged_s >= DROP_LOG_INTERVAL_S:
+                self._drop_logged_s = now_s
+                log.warning("samples are dropped", reason=self._drop_reason)
         elif self._drop_reason is not None:
             self._drop_reason, self._dropped_before = None, self._dropped_counts()
         if now_s < self._due_s or not self.latest:
@@ -226,10 +233,9 @@ class Publisher:
 
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_sent_s = self._started_s
-        parameters = make_parameters_payload(self._estimator, self._started_wall_s)
         return Snapshot(
             None,
-            parameters,
+            make_parameters_payload(self._estimator, self._started_wall_s),
             self._make_health(now_s, self._sensor_message(now_s)),
             self._make_info(),
             self.alarm_monitor.report,
@@ -331,9 +337,12 @@ class Publisher:
 
     def _make_info(self) -> Info:
         self._board = self._source.board or self._board  # properties of an unplugged board remain
-        sensed = bool(self._estimator.record["filter"]["sensed"][0])
         return make_info_payload(
-            self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed
+            self._settings,
+            self._cell,
+            self._board,
+            self._started_wall_s,
+            temperature_sensor=bool(self._estimator.record["filter"]["sensed"][0]),
         )
 
     def _sensor_message(self, now_s: float) -> str | None:
@@ -352,5 +361,8 @@ class Publisher:
 
     def _dropped_counts(self) -> dict[str, int]:
         """Return the dropped samples by kind."""
-        counted = sample_counters(self._estimator.state[0]).items()
-        return {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}
+        return {
+            name.removeprefix("dropped_"): n
+            for name, n in sample_counters(self._estimator.state[0]).items()
+            if name.startswith("dropped_")
+        }

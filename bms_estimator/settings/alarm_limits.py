@@ -17,7 +17,7 @@ from bms_estimator.settings.false_alarm_limits import (
     collapse_limit,
     weak_cell_limit,
 )
-from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.pack import PackSettings, Settings
 
 MIN_SILENT_LIMIT_S = 10.0
 """Minimum default limit of ``link_lost`` [s]."""
@@ -131,9 +131,17 @@ def monitored_alarms(settings: Settings, cell: PackModel) -> tuple[AlarmDefiniti
         UserError: A clear level lies beyond its limit.
     """
     defaults = _defaults(settings, cell)
-    configured = (name for name in ALARMS if name != STATE_LOST.name)
-    definitions = (_definition(name, getattr(settings.alarms, name), defaults[name]) for name in configured)
-    return (*(each for each in definitions if each is not None), STATE_LOST)
+    return (
+        *filter(
+            None,
+            (
+                _definition(name, getattr(settings.alarms, name), defaults[name])
+                for name in ALARMS
+                if name != STATE_LOST.name
+            ),
+        ),
+        STATE_LOST,
+    )
 
 
 def short_limit_a(settings: Settings, cell: PackModel) -> float:
@@ -242,7 +250,7 @@ def _defaults(settings: Settings, cell: PackModel) -> dict[AlarmName, _Default]:
         # the value is infinite after a failure, otherwise 0
         "hook_failed": _Default(1.0 if settings.alarms.hook else None, 1.0),
     }
-    return all_packs | cell.by_kind(_battery_defaults, _stack_defaults)
+    return all_packs | cell.by_kind(lambda battery: _battery_defaults(settings.pack, battery), _stack_defaults)
 
 
 def _collapse_default(settings: Settings) -> _Default:
@@ -265,13 +273,14 @@ def voltage_limits(cell: PackModel) -> VoltageLimits:
     return next(limits for max_nominal_v, limits in _VOLTAGE_LIMITS if nominal_v < max_nominal_v)
 
 
-def _battery_defaults(cell: CellModel) -> dict[AlarmName, _Default]:
+def _battery_defaults(pack: PackSettings, cell: CellModel) -> dict[AlarmName, _Default]:
     c, n = cell.cell, cell.cell.series_count
     v = voltage_limits(cell)
     short_a = MIN_SHORT_C * c.capacity_ah
     can_compare = n >= MIN_CELLS
-    charge_a = min(c.capacity_ah, c.current_max_a)  # most cells are charged at one C or less
-    discharge_a = min(MAX_DISCHARGE_C * c.capacity_ah, c.current_max_a)
+    # most cells are charged at one C or less
+    charge_a = min(pack.max_charge_a or c.capacity_ah, c.current_max_a)
+    discharge_a = min(pack.max_discharge_a or MAX_DISCHARGE_C * c.capacity_ah, c.current_max_a)
     return {
         "pack_over_voltage": _Default(n * v.over_v, n * v.over_clear_v),
         "pack_under_voltage": _Default(n * v.under_v, n * v.under_clear_v),

@@ -36,22 +36,30 @@ class FaultLog:
     def __init__(self) -> None:
         self._logged_faults, self._log_time_s = 0, -math.inf
 
-    def check(self, counters: Mapping[str, int], now_s: float) -> None:
+    def check(self, counters: Mapping[str, int], now_s: float, first_invalid: str = "") -> None:
         """Log the fault counters if they have changed and the minimum interval has passed.
 
         Args:
             counters: Counts since start, by name.
             now_s: Monotonic clock [s].
+            first_invalid: Description of the first value that is no number; empty without one.
         """
         nonzero = {name: n for name, n in counters.items() if name not in _NORMAL_EVENTS and n}
         faults = sum(1 if name in _LOGGED_ONCE else n for name, n in nonzero.items())
         if faults != self._logged_faults and now_s - self._log_time_s >= MIN_LOG_INTERVAL_S:
             self._logged_faults, self._log_time_s = faults, now_s
-            log.warning("faults on the line", **{_LOGGED_ONCE.get(name, name): n for name, n in nonzero.items()})
+            log.warning(
+                "faults on the line",
+                **{_LOGGED_ONCE.get(name, name): n for name, n in nonzero.items()},
+                **({"first": first_invalid} if first_invalid else {}),
+            )
 
 
 class SilenceLog:
-    """Log of the reasons why no samples arrive. Each reason is logged once until samples arrive, even if reasons alternate."""
+    """Log of the reasons why no samples arrive. Each reason is logged once until samples arrive, even if reasons alternate.
+
+    The end of a logged silence is logged, too.
+    """
 
     def __init__(self) -> None:
         self._logged_s: dict[str, float] = {}
@@ -59,6 +67,8 @@ class SilenceLog:
 
     def on_samples(self, now_s: float) -> None:
         """Permit each reason to be logged again. ``now_s`` is the monotonic clock [s]."""
+        if max(self._logged_s.values(), default=-math.inf) > self._samples_s:
+            log.info("samples arrive again")
         self._samples_s = now_s
 
     def report(self, reason: str, now_s: float) -> None:

@@ -111,6 +111,8 @@ CHECK_INTERVAL_S = 1.0
 """Interval between two checks for silence and faults [s]."""
 SILENT_PERIODS = 3.0
 """Number of sample periods without a sample after which a source counts as silent."""
+RECONNECT_GRACE_S = 30.0
+"""Additional time after a reconnection before a silent source is reported [s]. A device that publishes to a broker has to reconnect, too."""
 NO_SAMPLE_YET = "connected, no sample yet"
 """Reason for silence after a connection, unless the producer or the decoder reports a fault."""
 
@@ -152,6 +154,9 @@ class LineProducer(ABC):
     def counters(self) -> Mapping[str, int]:
         """Number of faults since start, by kind."""
         return {}
+
+    first_invalid: str = ""
+    """Description of the first value that is no number; empty without one."""
 
     @property
     def fault(self) -> str | None:
@@ -320,7 +325,10 @@ class LineSource:
             self._lines.put_nowait((self._wall_offset_s + self._monotonic(), line))
             return
         self._connections += 1
-        self._connected, self._last_sample_s = True, self._monotonic()
+        self._connected, self._last_sample_s = (
+            True,
+            self._monotonic() + (RECONNECT_GRACE_S if self._connections > 1 else 0.0),
+        )
         self._silence_reason = NO_SAMPLE_YET
         log.info("connected", source=self._producer.name)
 
@@ -331,7 +339,7 @@ class LineSource:
             if self._connected and now_s - self._last_sample_s >= self._silence_limit_s:
                 reason = self._producer.fault or self._decoder.fault or "connected, but silent"
                 self._report(f"{self._producer.name}: {reason}")
-            self._fault_log.check(self.counters, now_s)
+            self._fault_log.check(self.counters, now_s, self._producer.first_invalid)
             await asyncio.sleep(self._check_interval_s)
 
     def _report(self, reason: str) -> None:

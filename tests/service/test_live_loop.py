@@ -162,8 +162,7 @@ async def test_unusable_samples_are_dropped_and_counted() -> None:
         )
         await run.sink.until(lambda s: s.health.samples["gaps"] == 1)
         await run.end()
-    counters = run.sink.snapshots[-1].health.samples
-    assert counters == {
+    assert run.sink.snapshots[-1].health.samples == {
         "samples": 3,
         "dropped_not_finite": 2,
         "dropped_range": 2,
@@ -212,11 +211,14 @@ async def test_a_board_slower_than_the_publish_rate_stays_online(sensor: SensorS
 
 
 async def test_the_sensor_is_offline_while_all_samples_are_dropped() -> None:
-    async with run_loop() as run:
-        for second in range(3):
-            run.source.give(*((second + 0.01 * i, 0.1, 0.0) for i in range(100)))
-            await run.sink.until(lambda s: s.health.samples["dropped_range"] == 100 * (second + 1))  # noqa: B023
-        await run.end()
+    with capture_logs() as lines:
+        async with run_loop() as run:
+            for second in range(3):
+                run.source.give(*((second + 0.01 * i, 0.1, 0.0) for i in range(100)))
+                await run.sink.until(lambda s: s.health.samples["dropped_range"] == 100 * (second + 1))  # noqa: B023
+            await run.end()
+    (logged,) = (line["reason"] for line in lines if line["event"] == "samples are dropped")
+    assert logged.startswith("the last of them 0 V, 0.1 A, where 1.5..4.5 V and up to 5 A are possible")
     health = run.sink.snapshots[-1].health
     assert not health.sensor_online
     assert "outside the cell's range" in (health.sensor_message or "")

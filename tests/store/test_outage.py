@@ -39,7 +39,8 @@ async def test_states_of_an_outage_survive_a_kill_and_arrive_before_newer_ones_i
     await asyncio.to_thread(broker.start)
     async with Listener(broker) as live, service(pack) as process:
         await live.wait_json("bms/pack/state", lambda state: state["time"] > stored[-1][1])
-        await live.wait_json("bms/pack/event", lambda event: event["name"] == "unseen")
+        gap = await live.wait_json("bms/pack/event", lambda event: event["name"] == "unseen")
+        assert "the estimate has no measurements" in gap["text"]  # the killed run received some after its checkpoint
         await stop_service(process)
         received = [
             (topic, json.loads(payload)["time"]) for topic, payload, _ in live.messages if topic in QUEUED_TOPICS

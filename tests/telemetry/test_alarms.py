@@ -175,10 +175,13 @@ def test_a_mean_temperature_without_extremes_raises_an_alarm(temperature_c: floa
 
 
 def test_each_alarm_has_a_capture() -> None:
-    unrecorded = {"hook_failed", "alarm_state_lost", "weak_cell", "stability_margin_low", *COMPARISONS}
-    assert set(CAPTURES) == set(ALARMS) - unrecorded, (
-        "the alarms without a capture need hooks, earlier runs, several discharges, hours or three cells"
-    )
+    assert set(CAPTURES) == set(ALARMS) - {
+        "hook_failed",
+        "alarm_state_lost",
+        "weak_cell",
+        "stability_margin_low",
+        *COMPARISONS,
+    }, "the alarms without a capture need hooks, earlier runs, several discharges, hours or three cells"
 
 
 @pytest.mark.parametrize("name", CAPTURES)
@@ -270,8 +273,9 @@ async def test_collapse_risk_contains_probability_and_time_left_and_does_not_dep
 async def test_a_higher_accepted_rate_of_false_alarms_warns_earlier(knee: Path) -> None:
     times_s = []
     for rate in (1.0, 3.0):
-        alarms = {"collapse_risk": {"false_alarms_per_month": rate}}
-        result = await replayed(knee, settings(alarms, pack={}), at_once=True)
+        result = await replayed(
+            knee, settings({"collapse_risk": {"false_alarms_per_month": rate}}, pack={}), at_once=True
+        )
         times_s.append(result.transitions("collapse_risk")[0][0])
     assert times_s[1] < times_s[0]
 
@@ -566,8 +570,14 @@ def test_limits_depend_on_chemistry_size_and_settings() -> None:
     lfp = {alarm.name: alarm for alarm in monitored_alarms(settings(), lfp_pack)}
     assert (lfp["pack_over_voltage"].limit, lfp["pack_over_voltage"].clear) == pytest.approx((58.4, 54.4))
     assert (lfp["discharge_over_current"].limit, lfp["charge_over_current"].limit) == (1000.0, 200.0)
-    limits = {"pack_over_voltage": {"limit_v": 57.6}, "cell_imbalance": {"enabled": False}}
-    configured = {alarm.name: alarm for alarm in monitored_alarms(settings(limits), lfp_pack)}
+    limits = {
+        "pack_over_voltage": {"limit_v": 57.6},
+        "cell_imbalance": {"enabled": False},
+        "charge_over_current": {"limit_a": 120.0},
+    }
+    rated = settings(limits, pack={"max_discharge_a": 150.0, "max_charge_a": 90.0})
+    configured = {alarm.name: alarm for alarm in monitored_alarms(rated, lfp_pack)}
+    assert (configured["discharge_over_current"].limit, configured["charge_over_current"].limit) == (150.0, 120.0)
     assert configured["pack_over_voltage"].clear == pytest.approx(53.6)
     assert configured["pack_over_voltage"].latch
     assert "cell_imbalance" not in configured
@@ -912,9 +922,8 @@ def test_a_state_of_the_version_before_keeps_alarms_delays_acknowledgements_and_
 
 
 def test_damaged_saved_quantities_are_rejected() -> None:
-    alarms = make_evaluator()
     with pytest.raises(ValueError, match="temperature: measured = -1"):
-        alarms.restore(json.dumps({"inputs": {"temperature": [-1, True]}}))
+        make_evaluator().restore(json.dumps({"inputs": {"temperature": [-1, True]}}))
 
 
 @pytest.mark.parametrize("spacing_s", [0.0, 0.1, 1.0])

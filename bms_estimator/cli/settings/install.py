@@ -11,9 +11,11 @@ import typer
 
 from bms_estimator.installation import paths
 from bms_estimator.installation.install import (
+    USER_STATE,
     PackFiles,
     compile_ahead,
     install,
+    require_stopped,
     restart_running_units,
     start_service,
     uninstall,
@@ -30,7 +32,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.version import __version__
 
-USER_FOLDERS = (".local/state/bms-estimator", ".cache/bms_estimator")
+USER_FOLDERS = (USER_STATE, ".cache/bms_estimator")
 """Folders in a home folder with state and compiled kernels of a pack that its user runs without the service."""
 Root = Annotated[
     Path,
@@ -63,6 +65,13 @@ def install_command(
     program = _program(machine)
     with _errors_of_files():
         may_start = install(machine, program, files, _report)
+    hand_command = f"{program} run {paths.PACK_FILE}"
+    if may_start and machine.root == Path("/") and not no_start:
+        require_stopped(
+            load_settings(paths.PACK_FILE),
+            _user_home(),
+            (hand_command if machine.lacks_systemd else f"systemctl restart {paths.NAME}"),
+        )
     if machine.has_running_systemd and not no_start:
         if may_start:
             compile_ahead(program)
@@ -77,6 +86,9 @@ def install_command(
         return
     page = load_settings(settings).page
     typer.echo("\nNext:")
+    if machine.lacks_systemd:
+        _show_next((f"sudo {hand_command}", "run the pack by hand, because systemd does not run here"))
+        return
     _show_next(
         (f"systemctl status {paths.NAME}", "show the state of charge, or why no samples arrive"),
         (f"journalctl -u {paths.NAME} -f", "show the log"),
@@ -96,9 +108,7 @@ def uninstall_command(
     program, has_settings = _own_path(), machine.path(paths.PACK_FILE).exists()
     with _errors_of_files():
         remaining = uninstall(machine, purge=purge, report=_report)
-    home = Path(f"~{os.environ.get('SUDO_USER', 'root')}").expanduser()
-    user_folders = (home / name for name in USER_FOLDERS)
-    remaining += [path for path in user_folders if machine.path(path).exists()]
+    remaining += [path for path in (_user_home() / name for name in USER_FOLDERS) if machine.path(path).exists()]
     if program.exists():
         remaining.append(program)
     if has_settings:
@@ -168,6 +178,11 @@ def _program(machine: Machine) -> Path:
     copy_program(target, installed_as=paths.PROGRAM_COPY, python=python)
     _report("program", f"{paths.PROGRAM_COPY}, version {__version__}")
     return paths.PROGRAM_COPY / "bin" / paths.NAME
+
+
+def _user_home() -> Path:
+    """Return the home folder of the user who called sudo."""
+    return Path(f"~{os.environ.get('SUDO_USER', 'root')}").expanduser()
 
 
 def _own_path() -> Path:

@@ -214,7 +214,7 @@ class Health(Payload):
         default=None, description="fit of the pack's model; null: none, as for a fuel cell"
     )
     unseen_s: float | None = Field(
-        description="length of the last gap in the samples or before the start [s]; "
+        description="length of the last gap in the samples of the estimate, which after a kill begins at the last checkpoint [s]; "
         "null: no gap since the start, or unknown"
     )
     total: Totals = Field(description="totals over restarts")

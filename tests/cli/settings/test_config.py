@@ -224,7 +224,11 @@ def cell_file(tmp_path):
             "max_discharge_a = 60",
             "pack.max_discharge_a = 60: above 15 A, the limit of valid samples (current_max_a",
         ),
-        ({}, "max_charge_a = 9", "pack.max_charge_a = 9: above 3 A, the limit of the alarm charge_over_current, which"),
+        (
+            {},
+            "max_charge_a = 9\n[alarms.charge_over_current]\nlimit_a = 3",
+            "pack.max_charge_a = 9: above 3 A, the limit of the alarm charge_over_current, which",
+        ),
         (
             {},
             (

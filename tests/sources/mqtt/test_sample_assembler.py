@@ -207,8 +207,7 @@ def test_messages_of_a_project_are_assembled_to_one_sample(project: str) -> None
     assert feed(assembler, messages, 10.0)[0]["current_a"] == sample["current_a"]
     assert assembler.fault is None
     assert set(assembler.counters.values()) == {0}
-    settings = Settings.model_validate({"source": {"kind": "mqtt"} | table})
-    assert settings.sensor.current_sign == sign
+    assert Settings.model_validate({"source": {"kind": "mqtt"} | table}).sensor.current_sign == sign
 
 
 def test_cell_voltages_published_after_the_current_belong_to_the_next_sample() -> None:
@@ -257,8 +256,12 @@ def test_values_are_read_by_configured_path_unit_scale_and_time(
 
 def test_line_of_a_pack_with_the_maximum_number_of_cells_is_decoded() -> None:
     assembler, decoder = SampleAssembler(json_source(cells="c")), TextProtocol()
-    payload = json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELL_NUMBER})
-    assembler.add_message("home/pack", payload.encode(), 0.0, retained=False)
+    assembler.add_message(
+        "home/pack",
+        json.dumps({"u": 1460.1234, "i": -321.123, "c": [3.6512] * MAX_CELL_NUMBER}).encode(),
+        0.0,
+        retained=False,
+    )
     assert decoder.feed(0.0, assembler.line(0.0)).size == 1
     assert decoder.cells.shape == (1, MAX_CELL_NUMBER)
 
@@ -292,8 +295,7 @@ def test_a_voltage_is_used_once_and_the_samples_of_later_currents_mark_it() -> N
         for now_s in (time_s, time_s + 0.45, time_s + 0.55):
             block = decoder.feed(now_s, assembler.line(now_s))
             samples += block[["voltage_v", "status"]].tolist()
-    measured = [voltage_v for voltage_v, status in samples if not status & SampleStatus.VOLTAGE_HELD]
-    assert measured == [52.0, 51.0, 50.0]
+    assert [voltage_v for voltage_v, status in samples if not status & SampleStatus.VOLTAGE_HELD] == [52.0, 51.0, 50.0]
     assert len(samples) >= 20
 
 
@@ -317,8 +319,9 @@ def test_values_once_a_minute_and_half_a_minute_apart_give_samples_without_furth
 
 
 def test_the_values_of_a_publisher_that_sends_only_changes_hold_for_its_longest_silence() -> None:
-    settings = source(voltage={"topic": "v"}, current={"topic": "i"}, interval_s=60.0, max_silent_s=300.0)
-    assembler = SampleAssembler(settings)
+    assembler = SampleAssembler(
+        source(voltage={"topic": "v"}, current={"topic": "i"}, interval_s=60.0, max_silent_s=300.0)
+    )
     assert feed(assembler, [("v", "52"), ("i", "1")]) == [{"voltage_v": 52.0, "current_a": 1.0}]
     now_s, repeated_s = 0.0, []
     while (wait_s := assembler.wait_s(now_s)) is not None:
@@ -371,8 +374,10 @@ def test_retained_and_constant_values_count_while_a_publisher_is_online(max_sile
             max_silent_s=max_silent_s,
         )
     )
-    state = [("home/pack", '{"u": 52, "i": 1}'), ("home/probe", "21"), ("home/soc", "62")]
-    assert feed(assembler, state, retained=True) == []
+    assert (
+        feed(assembler, [("home/pack", '{"u": 52, "i": 1}'), ("home/probe", "21"), ("home/soc", "62")], retained=True)
+        == []
+    )
     samples = feed(assembler, [("home/status", "online")], 1.0, retained=True)
     complete = {"voltage_v": 52.0, "current_a": 1.0, "temperature_c": 21.0, "device_soc": 0.62}
     assert samples == [complete] * bool(max_silent_s)
@@ -434,6 +439,7 @@ def test_invalid_payload_is_counted_and_reported(payload: str, counter: str, rea
     assert assembler.counters[counter] >= 1
     assert reason in (assembler.fault or "")
     assert feed(assembler, [("home/pack", '{"u": 52, "i": 1}')], 1.0) == [{"voltage_v": 52.0, "current_a": 1.0}]
+    assert reason in assembler.first_faults[counter]  # also after valid values
 
 
 @given(st.binary() | st.recursive(st.none() | st.floats() | st.text(), st.lists).map(json.dumps).map(str.encode))
@@ -464,8 +470,10 @@ def test_esphome_node_may_have_a_prefix_of_its_own_and_sensors_without_the_name_
 
 
 def test_topics_of_several_values_are_subscribed_once() -> None:
-    jk = source(profile="esphome-jk", prefix="jk-bms")
-    assert SampleAssembler(jk).topics == ["jk-bms/sensor/+/state", "jk-bms/status"]
+    assert SampleAssembler(source(profile="esphome-jk", prefix="jk-bms")).topics == [
+        "jk-bms/sensor/+/state",
+        "jk-bms/status",
+    ]
     assert SampleAssembler(json_source()).topics == ["home/pack"]
 
 
@@ -545,8 +553,9 @@ def test_second_publisher_of_a_topic_is_reported_until_it_stops(period_s: float)
 
 @pytest.mark.parametrize("on_s", [1, 2, 3, 10])
 def test_load_that_switches_regularly_does_not_count_as_a_second_publisher(on_s: int) -> None:
-    messages = [(float(second), 80.0 if second // on_s % 2 else -5.0) for second in range(1000)]
-    assembler, times_s = _conflict_times(messages)
+    assembler, times_s = _conflict_times(
+        [(float(second), 80.0 if second // on_s % 2 else -5.0) for second in range(1000)]
+    )
     assert (assembler.conflict, times_s) == ("", [])
 
 
@@ -653,8 +662,10 @@ def test_one_cell_voltage_that_stays_null_is_removed_from_the_sample() -> None:
 
 def test_cell_slots_of_an_esphome_node_without_a_cell_are_no_cells() -> None:
     node = source(profile="esphome-jk", prefix="jk-bms")
-    messages = esphome("jk-bms", "total_voltage", "current", "temperature_sensor_1", "cell_voltage_{}", empty_slots=8)
-    (sample,) = feed(SampleAssembler(node), messages)
+    (sample,) = feed(
+        SampleAssembler(node),
+        esphome("jk-bms", "total_voltage", "current", "temperature_sensor_1", "cell_voltage_{}", empty_slots=8),
+    )
     assert len(sample["cells_v"]) == 24
     (cells_v,) = CellSlots(16).select(np.array([sample["cells_v"]])).tolist()
     assert cells_v == [pytest.approx(3.3 + 0.001 * n) for n in range(1, 17)]
