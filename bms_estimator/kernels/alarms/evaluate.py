@@ -8,7 +8,7 @@ while a quantity that it needs is lost.
 
 import math
 
-from bms_estimator.kernels.accumulators.soc_certainty import is_soc_known
+from bms_estimator.kernels.accumulators.publish_window import is_soc_known
 from bms_estimator.kernels.alarms.quantities import (
     MAX_SPACING_FRACTION,
     is_blinded,
