@@ -44,8 +44,7 @@ from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_FIT, ELEMENT
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import EQUIVALENT
 from bms_estimator.kernels.kalman_filter.input_checks import CHECKS, COUNTERS
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE
-from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS, LEARNING_STATE
-from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS, OBSERVER_STATE
+from bms_estimator.kernels.observer.records import LEARNING_SETTINGS, LEARNING_STATE, OBSERVER_SETTINGS, OBSERVER_STATE
 from bms_estimator.kernels.observer.series_resistance import SERIES_RESISTANCE
 
 ESTIMATOR_SETTINGS = np.dtype(
