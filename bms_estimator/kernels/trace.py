@@ -25,7 +25,7 @@ TRACE = np.dtype(
         ("delta_1", "f8"),  # SOC below which C_ts of the model is negative (2.11)
         ("delta_2", "f8"),  # SOC below which C_tl of the model is negative (2.12)
         ("delta_configured", "i8"),  # 1: no data have changed delta_1 and delta_2
-        ("stability_margin", "f8"),  # soc - max(delta_1, delta_2), or NaN (``kernels/stability_margin.py``)
+        ("stability_margin", "f8"),  # soc - max(delta_1, delta_2), or NaN (``kernels/identifier.py``)
         ("stability_margin_std", "f8"),
         ("lock", "i8"),  # 1 while the observer tracks the voltage
         ("converged", "i8"),  # 1: |e| < eps2 of Algorithm 1
