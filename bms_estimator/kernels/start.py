@@ -25,8 +25,12 @@ from bms_estimator.kernels.kalman_filter.hypotheses import (
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, limit_soc_std, merge_all
 from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
-from bms_estimator.kernels.kalman_filter.temperature import update_arrhenius_factors
-from bms_estimator.kernels.kalman_filter.window import add_to_window, prepare_transition, reset_window
+from bms_estimator.kernels.kalman_filter.window import (
+    add_to_window,
+    prepare_transition,
+    reset_window,
+    update_arrhenius_factors,
+)
 from bms_estimator.kernels.observer.learning_law import initialize_learning, initialize_states_at_rest
 from bms_estimator.kernels.observer.series_resistance import (
     initialize_series_resistance,

@@ -17,7 +17,6 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     REFERENCE_C,
     on_grid,
 )
-from bms_estimator.kernels.kalman_filter.current_offset import update_offset_at_rest
 from bms_estimator.kernels.kalman_filter.ekf import (
     INDEPENDENT_R_STD,
     MAX_SOC,
@@ -62,10 +61,12 @@ from bms_estimator.kernels.kalman_filter.records import (
     X,
 )
 from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
-from bms_estimator.kernels.kalman_filter.temperature import (
+from bms_estimator.kernels.kalman_filter.window import (
+    prepare_transition,
+    reset_window,
     update_arrhenius_factors,
+    update_offset_at_rest,
 )
-from bms_estimator.kernels.kalman_filter.window import prepare_transition, reset_window
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 

@@ -1,4 +1,11 @@
-"""Window of about a second of samples, whose mean is one measurement of the filter.
+"""Window of about a second of samples, whose mean is one measurement of the filter, with self-heating and rest.
+
+Without a temperature sensor, the cell's temperature follows from the losses in the window.
+
+In a rest, the current sensor's offset is updated. The sensor reports the sum of true current and offset. If it reports zero,
+both are almost certainly zero, because a load rarely cancels the offset. A rest with a report of 50 mA gives no information,
+because the current may be an offset or a load. The smallest current reported so far bounds the dead band and the resolution of
+the sensor.
 
 ``s`` is a record of EKF_STATE, ``p`` of EKF_SETTINGS.
 """
@@ -12,10 +19,15 @@ from bms_estimator.kernels.cell_model.current_interpolation import (
 )
 from bms_estimator.kernels.cell_model.rc_ladder import (
     BRANCHES,
+    HIGH_ACTIVATION_ENERGY,
+    HYSTERESIS_ACTIVATION_ENERGY,
+    LOW_ACTIVATION_ENERGY,
+    REFERENCE_C,
     TAUS,
+    arrhenius,
+    resistances,
 )
-from bms_estimator.kernels.kalman_filter.current_offset import track_smallest_current
-from bms_estimator.kernels.kalman_filter.ekf import transition_diagonal
+from bms_estimator.kernels.kalman_filter.ekf import transition_diagonal, update_state_directly
 from bms_estimator.kernels.kalman_filter.gap_charge import (
     SKEW_VARIANCE,
     expected_excess_charge,
@@ -23,11 +35,11 @@ from bms_estimator.kernels.kalman_filter.gap_charge import (
     interpolation_charge_variance,
     rounding_charge_variance,
 )
-from bms_estimator.kernels.kalman_filter.temperature import (
-    MAX_RATE_K_S,
-    RATE_LIMIT_DELAY_S,
-    TEMPERATURE_S,
-    propagate_self_heating,
+from bms_estimator.kernels.kalman_filter.records import (
+    LN_R,
+    LN_R0,
+    OFFSET,
+    X,
 )
 from bms_estimator.model.arrays import Record
 from bms_estimator.model.unmeasured_time import MAX_FLOW_S
@@ -37,6 +49,27 @@ WINDOW_S = 0.99
 """Minimum duration of a window [s]. Each sample of a 1 Hz source is a window."""
 DECAY_TOLERANCE = 0.005
 """Relative change of the sample period below which the decays of the RC pairs are not computed again."""
+TEMPERATURE_S = 10.0
+"""Averaging time of a temperature sensor's noise [s]."""
+MAX_RATE_K_S = 0.1
+"""Maximum rate of change of a cell's temperature [K/s]."""
+RATE_LIMIT_DELAY_S = 60.0
+"""Delay until the rate limit of the temperature applies [s], because some sensors report 85 C at first."""
+HEAT_J = 22.0
+"""Heat capacity per Ah of a cell [J/(K Ah)]. Fits to an LG M50 at C/2 and 1C give 22 and 24 J/(K Ah)."""
+COOLING_S = 600.0
+"""Time constant of a cell's cooling in still air [s]. Fits to an LG M50 at C/2 and 1C give 650 and 570 s."""
+MAX_MODELLED_C = 80.0
+"""Maximum modelled temperature [C], so that a wrong current does not cause an implausible temperature for an hour."""
+REST_C = 0.01
+"""Maximum mean current of a window at rest, as a C-rate."""
+REST_S = 60.0
+"""Minimum duration of a rest [s]."""
+ZERO_C = 0.002
+"""Maximum mean current of a rest at which the current counts as zero, as a C-rate."""
+MIN_VARIANCE_RATIO = 4.0
+"""Minimum ratio of the variance of the offset to the variance of the offset measured in a rest, for an update.
+Successive rests have a common error, so that a rest does not update the offset again before its variance has grown."""
 
 
 @njit(cache=True)
@@ -133,3 +166,64 @@ def prepare_transition(s: Record, p: Record) -> None:
     if not s.sensed:
         propagate_self_heating(s, p)
     transition_diagonal(s, p)
+
+
+@njit(cache=True)
+def propagate_self_heating(s: Record, p: Record) -> None:
+    """Model the temperature at the end of the window by losses i^2 R_0 + sum x_k^2 R_k, in air of ``REFERENCE_C``."""
+    w, x = s.window, s.mean[s.best]
+    resistances(s.soc, p.weak_ohm, p.strong_ohm, s.weak, s.strong, s.ohm)
+    current_a = w.charge_as / w.time_s
+    loss_w = math.exp(x[LN_R0]) * s.ohm[0] * current_a * current_a
+    for k in range(BRANCHES):
+        loss_w += math.exp(x[LN_R]) * s.ohm[1 + k] * (s.x_a[k] + x[X + k]) ** 2
+    steady_c = REFERENCE_C + loss_w / p.series * COOLING_S / (HEAT_J * p.capacity_as / 3600.0)
+    s.temperature_c = steady_c + (s.temperature_c - steady_c) * math.exp(-w.time_s / COOLING_S)
+    s.temperature_c = min(s.temperature_c, MAX_MODELLED_C)
+
+
+@njit(cache=True)
+def update_arrhenius_factors(s: Record) -> None:
+    """Compute the Arrhenius factors at the cell's temperature."""
+    s.weak, s.strong = (
+        arrhenius(LOW_ACTIVATION_ENERGY, s.temperature_c),
+        arrhenius(HIGH_ACTIVATION_ENERGY, s.temperature_c),
+    )
+    s.hysteresis = arrhenius(HYSTERESIS_ACTIVATION_ENERGY, s.temperature_c)
+
+
+@njit(cache=True)
+def track_smallest_current(s: Record, current_a: float) -> None:
+    """Store the smallest nonzero current reported twice in succession. A single sample may be a mean over a step."""
+    reported_a = max(abs(current_a), abs(s.current_a))
+    if current_a != 0.0 and s.current_a != 0.0 and (s.smallest_a == 0.0 or reported_a < s.smallest_a):
+        s.smallest_a = reported_a
+
+
+@njit(cache=True)
+def update_offset_at_rest(s: Record, p: Record) -> None:
+    """Update the offset of every hypothesis after each minute of rest.
+
+    A small mean current may be offset or load. The measured offset is therefore half of this current. Its variance is the sum
+    of the squares of this half, of ``p.zero_std_c``, and of the std of a current hidden by resolution or dead band.
+    """
+    w, one_c = s.window, p.capacity_as / 3600.0
+    moved_as2 = w.charge_as * w.charge_as + w.between_as2 + w.unknown_as * w.unknown_as
+    if not moved_as2 <= (REST_C * one_c * w.time_s) ** 2:  # also for NaN
+        s.rest_s = s.rest_as = 0.0
+        return
+    s.rest_s += w.time_s
+    s.rest_as += w.charge_as
+    if s.rest_s < REST_S:
+        return
+    half_a = 0.5 * s.rest_as / s.rest_s
+    s.rest_s = s.rest_as = 0.0
+    # before the first nonzero current, the dead band and the resolution are unknown
+    if s.smallest_a == 0.0 or abs(half_a) > 0.5 * ZERO_C * one_c:
+        return
+    hidden_a = max(s.smallest_a, p.current_step_a, p.dead_band_a)
+    measured_a2 = (p.zero_std_c * one_c) ** 2 + hidden_a * hidden_a / 3.0 + half_a * half_a
+    for q in range(s.count):
+        offset_a2 = s.covariance[q, OFFSET, OFFSET]
+        if offset_a2 > MIN_VARIANCE_RATIO * measured_a2:
+            update_state_directly(s, p, q, OFFSET, half_a, offset_a2 * measured_a2 / (offset_a2 - measured_a2))

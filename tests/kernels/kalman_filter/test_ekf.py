@@ -15,7 +15,7 @@ from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
-from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, noise as ekf_noise, temperature, window
+from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, noise as ekf_noise, window
 from bms_estimator.kernels.kalman_filter.mixture import merge_pair, mixture_moments, prune_and_merge
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
@@ -259,7 +259,7 @@ def test_errors_do_not_decrease_above_the_temperatures_of_the_cell_file() -> Non
     s = make_state(p)
     variances = []
     for s["temperature_c"] in (30.0, 45.0, 60.0):
-        temperature.update_arrhenius_factors(s)
+        window.update_arrhenius_factors(s)
         variances.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0)))
     assert variances[1] == pytest.approx(1.5**2 * np.array(variances[0]), rel=0.01)
     assert variances[2] == pytest.approx(2.0**2 * np.array(variances[0]), rel=0.01)
