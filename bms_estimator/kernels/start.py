@@ -12,7 +12,6 @@ from bms_estimator.kernels.kalman_filter.ekf import predict
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     write_equivalent_circuit,
 )
-from bms_estimator.kernels.kalman_filter.gap_charge import is_resting
 from bms_estimator.kernels.kalman_filter.hypotheses import (
     begin_gap,
     forget_state_of_charge,
@@ -27,6 +26,7 @@ from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, limit_s
 from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.window import (
     add_to_window,
+    is_resting,
     prepare_transition,
     reset_window,
     update_arrhenius_factors,

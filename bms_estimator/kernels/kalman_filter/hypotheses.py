@@ -25,11 +25,6 @@ from bms_estimator.kernels.kalman_filter.ekf import (
     predict,
     update,
 )
-from bms_estimator.kernels.kalman_filter.gap_charge import (
-    LONG_TERM_S,
-    initialize_load_statistics,
-    update_load_statistics,
-)
 from bms_estimator.kernels.kalman_filter.mixture import (
     clear_hypothesis,
     copy_hypothesis,
@@ -62,9 +57,12 @@ from bms_estimator.kernels.kalman_filter.records import (
 )
 from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.window import (
+    LONG_TERM_S,
+    initialize_load_statistics,
     prepare_transition,
     reset_window,
     update_arrhenius_factors,
+    update_load_statistics,
     update_offset_at_rest,
 )
 from bms_estimator.model.arrays import Record

@@ -15,7 +15,7 @@ from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
-from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, noise as ekf_noise, window
+from bms_estimator.kernels.kalman_filter import ekf, hypotheses, noise as ekf_noise, window
 from bms_estimator.kernels.kalman_filter.mixture import merge_pair, mixture_moments, prune_and_merge
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
@@ -239,7 +239,7 @@ def test_the_load_assumed_in_a_gap_after_a_peak_may_have_continued_or_ended(firs
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
     hypotheses.initialize_filter(s, p, 0.55, first_c * one_c, 12.0)
-    unknown_std_c = gap_charge.gap_charge_std(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
+    unknown_std_c = window.gap_charge_std(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
     assert first_c - 1.29 < unknown_std_c < first_c
 
 
