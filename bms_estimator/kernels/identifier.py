@@ -35,6 +35,8 @@ from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     R_S,
     R_TL,
     R_TS,
+    VARYING,
+    detect_current_step,
     r_s_identified_by_steps,
     scale_is_identified,
     write_equivalent_circuit,
@@ -55,7 +57,6 @@ from bms_estimator.kernels.kalman_filter.input_checks import (
     update_input_faults,
 )
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
-from bms_estimator.kernels.kalman_filter.step_resistance import VARYING, detect_current_step
 from bms_estimator.kernels.kalman_filter.window import WINDOW_S, add_to_window, integrate_current
 from bms_estimator.kernels.start import restart_filter
 from bms_estimator.model.arrays import Record

@@ -10,6 +10,7 @@ from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.kernels.kalman_filter.anchors import continue_over_gap
 from bms_estimator.kernels.kalman_filter.ekf import predict
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
+    VARYING,
     write_equivalent_circuit,
 )
 from bms_estimator.kernels.kalman_filter.hypotheses import (
@@ -23,7 +24,6 @@ from bms_estimator.kernels.kalman_filter.hypotheses import (
 )
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, limit_soc_std, merge_all
-from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.window import (
     add_to_window,
     is_resting,

@@ -25,6 +25,7 @@ from bms_estimator.kernels.kalman_filter.ekf import (
     predict,
     update,
 )
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import VARYING
 from bms_estimator.kernels.kalman_filter.mixture import (
     clear_hypothesis,
     copy_hypothesis,
@@ -55,7 +56,6 @@ from bms_estimator.kernels.kalman_filter.records import (
     SOC,
     X,
 )
-from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.window import (
     LONG_TERM_S,
     initialize_load_statistics,
