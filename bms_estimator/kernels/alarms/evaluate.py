@@ -11,9 +11,14 @@ import math
 from bms_estimator.kernels.accumulators.publish_window import is_soc_known
 from bms_estimator.kernels.alarms.quantities import (
     MAX_SPACING_FRACTION,
+    cell_extremes,
+    count_values,
     is_blinded,
     lost_quantities,
+    measured_values,
+    possible_values,
     step_intervals,
+    uncertain_values,
     update_quantities,
 )
 from bms_estimator.kernels.alarms.records import (
@@ -31,14 +36,8 @@ from bms_estimator.kernels.alarms.records import (
     SENSOR_FAULT,
     SOC_LOW,
     WEAK_CELL,
-)
-from bms_estimator.kernels.alarms.states import raise_now, update
-from bms_estimator.kernels.alarms.values import (
-    cell_extremes,
-    count_values,
-    measured_values,
-    possible_values,
-    uncertain_values,
+    raise_now,
+    update,
 )
 from bms_estimator.model.arrays import Floats, Record, Records, SampleStatus
 from bms_estimator.numba_cache import njit
