@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.kernels.accumulators.publish_window import known_rows
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 
 
 @pytest.mark.parametrize(

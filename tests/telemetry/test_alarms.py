@@ -22,7 +22,7 @@ from bms_estimator.kernels.alarms.records import (
     acknowledge,
 )
 from bms_estimator.kernels.cells.records import ReadingFault
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc

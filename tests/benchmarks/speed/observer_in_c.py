@@ -9,7 +9,7 @@ import numpy as np
 from bms_estimator.kernels.cell_model.chen_mora import INVERSE_ERROR_V, OCV_POINTS
 from bms_estimator.kernels.observer.mittag_leffler import SERIES_LIMIT, SERIES_TERMS, TABLE_POINTS
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS, OBSERVER_STATE
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import SAMPLE, Records
 
 SOURCE = Path(__file__).with_name("uas_step.c")
