@@ -144,7 +144,7 @@ def update_alarm(
     step_s: float,
     value: float,
 ) -> None:
-    """Process a value of alarm ``k`` that no sample contains. ``states.update`` describes the last three arguments."""
+    """Process a value of alarm ``k`` that no sample contains. ``records.update`` describes the last three arguments."""
     update(alarms[0].states[k], limits[k], settings[0], io[0], log, k, at_s, step_s, value, 0)
 
 
