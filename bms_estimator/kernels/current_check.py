@@ -143,9 +143,11 @@ def accept_waiting(s: Record, p: Record, dt_s: float, current_a: float, voltage_
     """
     d = s.current_check
     d.seen_s = 0.0
+    if d.waiting == 0:
+        return False
     late_s = dt_s - d.age_s
     is_late = late_s <= max_step(s.observer, p) and voltage_follows(d, p, d.age_s, d.current_a, voltage_v)
-    if d.waiting > 0 and late_s > 0.0 and (is_near(d, current_a) or is_late):
+    if late_s > 0.0 and (is_near(d, current_a) or is_late):
         s.observer.samples += d.waiting
         d.waiting = 0
         return True

@@ -80,7 +80,7 @@ def kernel_and_c_ns(block: SampleBlock) -> tuple[float, float]:
         observer_in_c = ObserverInC(Path(folder))
 
         def run_c() -> None:
-            observer_in_c.run(c_estimator.state, c_estimator.settings, block, trace)
+            observer_in_c.run(c_estimator.record, c_estimator.settings_record, block, trace)
 
         def run_kernel() -> None:
             kernel.run(estimator.record, estimator.settings_record, block, trace)

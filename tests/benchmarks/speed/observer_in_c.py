@@ -7,10 +7,20 @@ from pathlib import Path
 import numpy as np
 
 from bms_estimator.kernels.cell_model.chen_mora import INVERSE_ERROR_V, OCV_POINTS
+from bms_estimator.kernels.current_check import (
+    CURRENT_CHECK,
+    FOLLOWED_FRACTION,
+    MAX_WAITING,
+    MAX_WRAPPED_FRACTION,
+    NEAR_FRACTION,
+    RC_HIDING_S,
+    STEPS_A,
+    UINT16_VALUES,
+)
 from bms_estimator.kernels.observer.mittag_leffler import SERIES_LIMIT, SERIES_TERMS, TABLE_POINTS
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS, OBSERVER_STATE
 from bms_estimator.kernels.records import TRACE
-from bms_estimator.model.arrays import SAMPLE, Records
+from bms_estimator.model.arrays import SAMPLE, Records, SampleStatus
 
 SOURCE = Path(__file__).with_name("uas_step.c")
 COMPILER = [
@@ -45,11 +55,12 @@ class ObserverInC:
         subprocess.run([*COMPILER, "-I", folder, "-o", library, SOURCE, "-lm"], check=True)
         self._run = ctypes.CDLL(str(library)).run
         self._run.restype = ctypes.c_int64
-        self._run.argtypes = [ctypes.c_void_p] * 4 + [ctypes.c_int64]
+        self._run.argtypes = [ctypes.c_void_p] * 5 + [ctypes.c_int64]
 
-    def run(self, state: Records, settings: Records, samples: Records, trace: Records) -> int:
-        """Run a block as ``kernels.step.run`` does."""
-        pointers = [array.ctypes.data for array in (state, settings, samples, trace)]
+    def run(self, record: Records, settings: Records, samples: Records, trace: Records) -> int:
+        """Run a block as ``kernels.step.run`` does. ``record`` is a record of ESTIMATOR_STATE, ``settings`` of its settings."""
+        state, check = record["observer"], record["current_check"]
+        pointers = [array.ctypes.data for array in (state, settings["observer"], check, samples, trace)]
         return int(self._run(*pointers, samples.size))
 
 
@@ -61,8 +72,22 @@ def header() -> str:
         "SERIES_TERMS": SERIES_TERMS,
         "SERIES_LIMIT": SERIES_LIMIT,
         "TABLE_POINTS": TABLE_POINTS,
+        "FOLLOWED_FRACTION": FOLLOWED_FRACTION,
+        "MAX_WAITING": MAX_WAITING,
+        "RC_HIDING_S": RC_HIDING_S,
+        "NEAR_FRACTION": NEAR_FRACTION,
+        "UINT16_VALUES": UINT16_VALUES,
+        "STEPS_A": str(STEPS_A).translate(str.maketrans("()", "{}")),
+        "MAX_WRAPPED_FRACTION": MAX_WRAPPED_FRACTION,
+        "HELD_BITS": int(SampleStatus.VOLTAGE_HELD | SampleStatus.CURRENT_HELD),
     }
-    records = {"settings_t": OBSERVER_SETTINGS, "state_t": OBSERVER_STATE, "sample_t": SAMPLE, "trace_t": TRACE}
+    records = {
+        "settings_t": OBSERVER_SETTINGS,
+        "state_t": OBSERVER_STATE,
+        "check_t": CURRENT_CHECK,
+        "sample_t": SAMPLE,
+        "trace_t": TRACE,
+    }
     lines = [f"#define {name} {value}" for name, value in constants.items()]
     return "\n".join(lines + [structure(name, record) for name, record in records.items()]) + "\n"
 

@@ -1,9 +1,10 @@
 /* Step of the adaptive observer of the thesis in C, with which the speed of the numba kernel is compared. For one sample:
  * checks of the input, Algorithm 1 of the thesis with equations (3.12), (3.13), (3.18) and (4.1), detection of a lost lock,
- * and a row of the trace. It computes what bms_estimator/kernels/{step,start}.py, kernels/observer/ and
+ * and a row of the trace. It computes what bms_estimator/kernels/{step,start,current_check}.py, kernels/observer/ and
  * kernels/cell_model/chen_mora.py do, with the same names. observer_in_c.py writes records.h from their record types. */
 
 #include <math.h>
+#include <stddef.h>
 #include <stdint.h>
 
 #include "records.h"
@@ -13,8 +14,9 @@
 #define UNMEASURED_S 60.0     /* beyond this interval the current between two samples counts as unknown [s] */
 #define LONGEST_FLOW_S 3600.0 /* maximum time over which charge is counted between two samples [s] */
 #define SATURATED_BITS 3u     /* status of a sample: voltage or current beyond the range of the converter */
+#define MAX_TIME_S 1e30       /* maximum magnitude of a time stamp [s] */
 
-enum verdict { ACCEPTED, NOT_FINITE, OUT_OF_RANGE, REPEATED, SATURATED };
+enum verdict { ACCEPTED, NOT_FINITE, OUT_OF_RANGE, REPEATED, SATURATED, CONTRADICTED };
 enum nussbaum { MITTAG_LEFFLER, K2_COS, K_COS_SQRT, LN_COS_SQRT_LN };
 
 /* circuit element over SOC */
@@ -285,7 +287,8 @@ static enum verdict judge(state_t *s, const settings_t *p, const sample_t *x)
         return SATURATED;
     }
     if (!(p->voltage_min_v <= x->voltage_v && x->voltage_v <= p->voltage_max_v &&
-          fabs(x->current_a) <= p->current_max_a)) {
+          fabs(x->current_a) <= p->current_max_a) ||
+        fabs(x->time_s) > MAX_TIME_S) {
         s->dropped_range++;
         return OUT_OF_RANGE;
     }
@@ -296,24 +299,110 @@ static enum verdict judge(state_t *s, const settings_t *p, const sample_t *x)
     return ACCEPTED;
 }
 
-static enum verdict step(state_t *s, const settings_t *p, const sample_t *x)
+static double max_step(const state_t *s, const settings_t *p)
+{
+    return fmax(p->gap_s, GAP_RATIO * s->step_s);
+}
+
+/* the voltage follows the change to current_a, or the change may be invisible */
+static int voltage_follows(const check_t *d, const settings_t *p, double dt_s, double current_a, double voltage_v)
+{
+    double drop_v = p->check_ohm * fabs(current_a - d->reference_a);
+    double hidden_v = p->check_slow_ohm * fabs(d->reference_a) * fmin(1.0, dt_s / RC_HIDING_S);
+    return drop_v <= p->check_v + hidden_v || fabs(voltage_v - d->reference_v) >= FOLLOWED_FRACTION * drop_v;
+}
+
+static int is_near(const check_t *d, double current_a)
+{
+    return fabs(current_a - d->current_a) <= NEAR_FRACTION * fabs(d->current_a - d->reference_a);
+}
+
+/* the current may be a small negative number of 16 bits that was read as an unsigned one */
+static int is_wrapped(double current_a)
+{
+    static const double steps_a[] = STEPS_A;
+    int wrapped = 0;
+    for (size_t i = 0; i < sizeof steps_a / sizeof *steps_a; i++) {
+        double below_a = UINT16_VALUES * steps_a[i] - fabs(current_a);
+        wrapped |= 0.0 <= below_a && below_a <= MAX_WRAPPED_FRACTION * UINT16_VALUES * steps_a[i];
+    }
+    return wrapped;
+}
+
+static void reject_waiting(state_t *s, check_t *d)
+{
+    s->dropped_contradicted += d->waiting;
+    d->waiting = 0;
+}
+
+/* the sample waits for the next one, or is rejected */
+static int is_doubtful(state_t *s, const settings_t *p, check_t *d, const sample_t *x)
+{
+    double dt_s = x->time_s - s->time_s;
+    if (!s->started || x->status & HELD_BITS || !(dt_s > 0.0) || dt_s - d->seen_s > max_step(s, p) ||
+        voltage_follows(d, p, dt_s, x->current_a, x->voltage_v))
+        return 0;
+    if (is_wrapped(x->current_a)) {
+        d->seen_s = dt_s;
+        s->dropped_contradicted++;
+        return 1;
+    }
+    if (d->waiting > 0 && !is_near(d, x->current_a))
+        reject_waiting(s, d);
+    if (d->waiting == MAX_WAITING)
+        return 0;
+    if (d->waiting == 0)
+        d->age_s = dt_s, d->current_a = x->current_a, d->voltage_v = x->voltage_v;
+    d->seen_s = dt_s;
+    d->waiting++;
+    return 1;
+}
+
+/* this sample confirms the samples that wait; otherwise they are rejected */
+static int accept_waiting(state_t *s, const settings_t *p, check_t *d, double dt_s, const sample_t *x)
+{
+    d->seen_s = 0.0;
+    if (d->waiting == 0)
+        return 0;
+    double late_s = dt_s - d->age_s;
+    if (late_s > 0.0 &&
+        (is_near(d, x->current_a) ||
+         (late_s <= max_step(s, p) && voltage_follows(d, p, d->age_s, d->current_a, x->voltage_v)))) {
+        s->samples += d->waiting;
+        d->waiting = 0;
+        return 1;
+    }
+    reject_waiting(s, d);
+    return 0;
+}
+
+static enum verdict step(state_t *s, const settings_t *p, check_t *d, const sample_t *x)
 {
     enum verdict verdict = judge(s, p, x);
     if (verdict != ACCEPTED)
         return verdict;
+    if (is_doubtful(s, p, d, x))
+        return CONTRADICTED;
     s->samples++;
     if (!s->started) {
+        d->reference_a = x->current_a, d->reference_v = x->voltage_v;
         start(s, p, x->time_s, x->current_a, x->voltage_v);
         return verdict;
     }
     double dt_s = x->time_s - s->time_s;
+    if (accept_waiting(s, p, d, dt_s, x)) {
+        observer_step(s, p, d->age_s, d->current_a, d->voltage_v);
+        dt_s -= d->age_s;
+    }
+    if (!(x->status & HELD_BITS))
+        d->reference_a = x->current_a, d->reference_v = x->voltage_v;
     s->time_s = x->time_s;
     if (dt_s < 0.0) {
         s->time_steps_back += isfinite(dt_s) ? 1 : 0;
         s->current_a = x->current_a;
         return verdict;
     }
-    if (dt_s > fmax(p->gap_s, GAP_RATIO * s->step_s))
+    if (dt_s > max_step(s, p))
         s->gaps++;
     s->step_s = dt_s;
     observer_step(s, p, dt_s, x->current_a, x->voltage_v);
@@ -333,6 +422,9 @@ static void write_row(trace_t *row, const state_t *s, const settings_t *p, const
     row->k = s->k;
     row->delta_1 = s->delta_1;
     row->delta_2 = s->delta_2;
+    row->delta_configured = 1;
+    for (int i = 7; i < 13; i++)
+        row->delta_configured &= s->target[i] == p->target[i];
     row->stability_margin = row->stability_margin_std = NAN;
     row->lock = s->lock;
     row->converged = fabs(s->innovation_v) < p->epsilon_v;
@@ -343,11 +435,11 @@ static void write_row(trace_t *row, const state_t *s, const settings_t *p, const
 }
 
 /* process n samples; return the number of rows written to the trace */
-int64_t run(state_t *state, const settings_t *settings, const sample_t *samples, trace_t *trace, int64_t n)
+int64_t run(state_t *state, const settings_t *settings, check_t *check, const sample_t *samples, trace_t *trace, int64_t n)
 {
     int64_t rows = 0;
     for (int64_t j = 0; j < n; j++)
-        if (step(state, settings, samples + j) == ACCEPTED)
+        if (step(state, settings, check, samples + j) == ACCEPTED)
             write_row(trace + rows++, state, settings, samples + j);
     return rows;
 }
