@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop
+from bms_estimator.kernels.cell_model.fuel_cell import open_loop
 from bms_estimator.model.arrays import Floats
 from bms_estimator.numba_cache import njit
 

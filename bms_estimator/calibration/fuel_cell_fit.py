@@ -14,9 +14,8 @@ from typing import get_args
 import numpy as np
 from scipy.optimize import least_squares
 
-from bms_estimator.kernels.cell_model.fuel_cell import NAMES
-from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
-from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.kernels.cell_model.fuel_cell import NAMES, open_loop, polarisation
+from bms_estimator.kernels.observer.records import LEARNABLE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import FuelCellModel, Parameter

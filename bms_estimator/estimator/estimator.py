@@ -15,9 +15,8 @@ from bms_estimator.kernels.kalman_filter.anchors import NO_ANCHOR, apply_prior
 from bms_estimator.kernels.kalman_filter.hypotheses import USER_SOC_STD, set_soc, weakest_cell_soc_std
 from bms_estimator.kernels.kalman_filter.input_checks import FITTED_FAULTS, UNUSABLE, store_last_good_state
 from bms_estimator.kernels.observer.records import OBSERVER_STATE
-from bms_estimator.kernels.records import ESTIMATOR_STATE
+from bms_estimator.kernels.records import ESTIMATOR_STATE, TRACE
 from bms_estimator.kernels.step import SampleOutcome
-from bms_estimator.kernels.trace import TRACE
 from bms_estimator.model.arrays import SAMPLE, Records, SampleBlock
 from bms_estimator.model.columns import Columns
 from bms_estimator.model.pack_model import PackModel

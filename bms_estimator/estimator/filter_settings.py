@@ -16,8 +16,8 @@ from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, GRID, RESISTANC
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, Noise
 from bms_estimator.kernels.observer.chen_mora_sensitivity import NAMES
-from bms_estimator.kernels.observer.learning_model import Model
-from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
+from bms_estimator.kernels.observer.learning_law import Model
+from bms_estimator.kernels.observer.records import LEARNING_SETTINGS
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.unmeasured_time import UNMEASURED_S

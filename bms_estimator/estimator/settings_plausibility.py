@@ -14,8 +14,8 @@ from bms_estimator.estimator.anchor_settings import (
     soc_at_full,
 )
 from bms_estimator.estimator.settings_records import ocv_grid
-from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
-from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.kernels.cell_model.fuel_cell import polarisation
+from bms_estimator.kernels.observer.records import LEARNABLE
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.errors import UserError

@@ -20,11 +20,10 @@ from bms_estimator.estimator.filter_settings import (
 from bms_estimator.kernels.cell_model.chen_mora import OCV_POINTS, PARAMETERS, emf, r_s, r_tl, r_ts
 from bms_estimator.kernels.cell_model.current_interpolation import MAX_STEP_PERIODS
 from bms_estimator.kernels.cell_model.fuel_cell import NAMES
-from bms_estimator.kernels.observer.learning_model import Model
-from bms_estimator.kernels.observer.learning_records import LEARNING_SETTINGS
+from bms_estimator.kernels.observer.learning_law import Model
 from bms_estimator.kernels.observer.mittag_leffler import decay_table, series_coefficients
-from bms_estimator.kernels.observer.nussbaum import Nussbaum
-from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS
+from bms_estimator.kernels.observer.observer import Nussbaum
+from bms_estimator.kernels.observer.records import LEARNING_SETTINGS, OBSERVER_SETTINGS
 from bms_estimator.kernels.records import ESTIMATOR_SETTINGS
 from bms_estimator.model.arrays import Floats, Records, exp
 from bms_estimator.model.cell import CellModel, Rated

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.forecast.trip import GivenLoad
 from bms_estimator.kernels.forecast.load_seconds import LOAD, MAX_LOAD_S, add_rows, copy_seconds
-from bms_estimator.kernels.kalman_filter.current_offset import REST_C
 from bms_estimator.kernels.kalman_filter.ekf import CHARGE_C
+from bms_estimator.kernels.kalman_filter.window import REST_C
 from bms_estimator.model.arrays import Floats, Records
 from bms_estimator.model.unmeasured_time import UNMEASURED_S
 

@@ -13,10 +13,14 @@ from numpy.typing import NDArray
 from bms_estimator.forecast.available_power import ForecastCurve
 from bms_estimator.forecast.load_history import MINUTE_S, LoadSpread
 from bms_estimator.forecast.trip import GivenLoad
-from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
 from bms_estimator.kernels.forecast.draws import DRAW, draw_load_factors, draw_packs
 from bms_estimator.kernels.forecast.given_load import LOAD_PART, set_decays, simulate_given_load
-from bms_estimator.kernels.forecast.observed_load import record_curves, simulate_observed_load
+from bms_estimator.kernels.forecast.observed_load import (
+    LOAD_BLOCK,
+    record_curves,
+    simulate_observed_load,
+    tabulate_blocks,
+)
 from bms_estimator.model.arrays import Floats, Records
 
 

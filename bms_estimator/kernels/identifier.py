@@ -2,6 +2,10 @@
 
 The adaptive law is (3.18) of the thesis. Errata are listed in docs/theory/thesis.md.
 
+The map also gives the stability margin of thesis 2.1.2, which is SOC minus max(delta1, delta2). delta1 (2.11) and delta2 (2.12)
+follow from a7..a12, the parameters of C_ts and C_tl. Before data have determined these parameters, delta1 and delta2 are a
+property of the cell file's formula, and there is no margin.
+
 ``s`` is a record of ESTIMATOR_STATE, ``p`` of ESTIMATOR_SETTINGS.
 """
 
@@ -31,6 +35,8 @@ from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
     R_S,
     R_TL,
     R_TS,
+    VARYING,
+    detect_current_step,
     r_s_identified_by_steps,
     scale_is_identified,
     write_equivalent_circuit,
@@ -51,7 +57,6 @@ from bms_estimator.kernels.kalman_filter.input_checks import (
     update_input_faults,
 )
 from bms_estimator.kernels.kalman_filter.records import LN_R, LN_R0
-from bms_estimator.kernels.kalman_filter.step_resistance import VARYING, detect_current_step
 from bms_estimator.kernels.kalman_filter.window import WINDOW_S, add_to_window, integrate_current
 from bms_estimator.kernels.start import restart_filter
 from bms_estimator.model.arrays import Record
@@ -65,6 +70,10 @@ LONG_GAP = 2
 """Value of ``window.gap`` after a gap in which the pack may have been charged or exchanged."""
 MIN_EXCITATION_C = 0.05
 """Minimum load that excites the resistances, as a C-rate, RMS over 10 min."""
+VALID_FIT_STD = 0.5
+"""Maximum relative std of a valid a1..a15. Amplitudes and exponents can be separated only after a sweep of the SOC."""
+VALID_STD = 0.3
+"""Maximum relative std of a valid circuit element, and of the resistances of the RC ladder for a valid time constant."""
 
 
 @njit(cache=True)
@@ -254,3 +263,48 @@ def set_target(s: Record, p: Record, i: int, value: float) -> None:
     s.target[i] = value
     if p.drive[i] == 0.0:
         s.a[i] = value
+
+
+@njit(cache=True)
+def margin_with_std(s: Record, p: Record, soc_std: float) -> tuple[float, float]:
+    """Return the stability margin and its std, both NaN unless max(delta1, delta2) is above 0 and a7..a12 are valid.
+
+    a7..a12 are valid under the conditions of the payload ``parameters``. ``soc_std`` is the std of the SOC.
+    """
+    o = s.observer
+    e = CAPACITANCES[0] if o.delta_1 >= o.delta_2 else CAPACITANCES[1]
+    limit, limit_std = max(o.delta_1, o.delta_2), s.fit.delta_std[e]
+    # ``limit_std`` is 0 from a checkpoint of an earlier version until the next fit
+    is_identified = p.identify and not p.learning.enabled and p.filter.r_std < VALID_STD and limit_std > 0.0
+    if not (limit > 0.0 and is_identified and has_valid_parameters(s, p, 2) and has_valid_parameters(s, p, 3)):
+        return math.nan, math.nan
+    i = 3 * e + 1
+    # the observer's parameters differ from the fit while they converge, and if a bound limits them
+    difference = delta(s.fit.a[i + 1], s.fit.a[i + 2], s.fit.a[i]) - limit
+    return o.soc - limit, math.sqrt(soc_std * soc_std + limit_std * limit_std + difference * difference)
+
+
+@njit(cache=True)
+def has_valid_parameters(s: Record, p: Record, e: int) -> bool:
+    """Return True if data have determined the three parameters of element ``e``, an index of ``ELEMENT_NAMES``."""
+    o, fit = s.observer, s.fit
+    if fit.bins[e] < MIN_BINS or not math.isfinite(s.unlearned_s[e]):
+        return False
+    for i in range(3 * e + 1, 3 * e + 4):
+        std = math.sqrt(fit.std[i] ** 2 + (fit.a[i] - o.a[i]) ** 2)
+        if o.target[i] == p.observer.target[i] or not std < VALID_FIT_STD * abs(o.a[i]):
+            return False
+    return True
+
+
+@njit(cache=True)
+def is_delta_configured(s: Record, p: Record) -> bool:
+    """Return True if no data have changed delta1 and delta2. False for a fuel cell, which has neither.
+
+    The identifier changes the limits of a7..a12. The learning law changes only the scale of C_ts and C_tl.
+    """
+    o = s.observer
+    for i in range(3 * CAPACITANCES[0] + 1, 3 * CAPACITANCES[1] + 4):
+        if o.target[i] != p.observer.target[i]:
+            return False
+    return not math.isnan(o.delta_1)

@@ -10,9 +10,9 @@ from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
 from bms_estimator.kernels.kalman_filter.anchors import continue_over_gap
 from bms_estimator.kernels.kalman_filter.ekf import predict
 from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
+    VARYING,
     write_equivalent_circuit,
 )
-from bms_estimator.kernels.kalman_filter.gap_charge import is_resting
 from bms_estimator.kernels.kalman_filter.hypotheses import (
     begin_gap,
     forget_state_of_charge,
@@ -24,9 +24,13 @@ from bms_estimator.kernels.kalman_filter.hypotheses import (
 )
 from bms_estimator.kernels.kalman_filter.input_checks import UNUSABLE, store_last_good_state
 from bms_estimator.kernels.kalman_filter.mixture import copy_hypothesis, limit_soc_std, merge_all
-from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
-from bms_estimator.kernels.kalman_filter.temperature import update_arrhenius_factors
-from bms_estimator.kernels.kalman_filter.window import add_to_window, prepare_transition, reset_window
+from bms_estimator.kernels.kalman_filter.window import (
+    add_to_window,
+    is_resting,
+    prepare_transition,
+    reset_window,
+    update_arrhenius_factors,
+)
 from bms_estimator.kernels.observer.learning_law import initialize_learning, initialize_states_at_rest
 from bms_estimator.kernels.observer.series_resistance import (
     initialize_series_resistance,

@@ -9,10 +9,17 @@ from enum import IntEnum
 from bms_estimator.kernels.accumulators.history import needs_caller
 from bms_estimator.kernels.cell_model.chen_mora import soc_from_ocv
 from bms_estimator.kernels.current_check import accept_waiting, is_doubtful, max_step, set_reference
-from bms_estimator.kernels.identifier import identifier_step
-from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, TAU_TL, TAU_TS, open_circuit
+from bms_estimator.kernels.identifier import identifier_step, is_delta_configured, margin_with_std
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import (
+    R_S,
+    R_TL,
+    R_TS,
+    TAU_TL,
+    TAU_TS,
+    VARYING,
+    open_circuit,
+)
 from bms_estimator.kernels.kalman_filter.hypotheses import weakest_cell_soc_std
-from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
 from bms_estimator.kernels.kalman_filter.window import widen_by_interpolation
 from bms_estimator.kernels.observer.learning_law import learning_step
 from bms_estimator.kernels.observer.observer import count_charge, initialize, observer_step
@@ -20,7 +27,6 @@ from bms_estimator.kernels.observer.series_resistance import (
     series_resistance,
     series_resistance_step,
 )
-from bms_estimator.kernels.stability_margin import is_delta_configured, margin_with_std
 from bms_estimator.kernels.start import initialize_state, plausible_temperature, restart_after_unknown_gap
 from bms_estimator.model.arrays import Record, Records, SampleStatus
 from bms_estimator.numba_cache import njit

@@ -15,7 +15,7 @@ from bms_estimator.estimator.settings_plausibility import forecast_end_v
 from bms_estimator.forecast.available_power import NO_FORECAST, ForecastRows, power_limits
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.load_history import load_arrays, restore_load
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import NO_CELLS, NO_SOC, CellBlock, Floats, SampleBlock
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.pack.state import (

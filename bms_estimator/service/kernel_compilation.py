@@ -56,7 +56,7 @@ class Kernel(NamedTuple):
     cpu_s: float
     """Recorded CPU time of its compilation, without the kernels that it calls [s]."""
     call: str
-    """Name and types of the arguments, such as ``kernels.trace.write (TRACE, float64,)``."""
+    """Name and types of the arguments, such as ``kernels.accumulators.history.needs_caller (HISTORY,)``."""
 
 
 def compile_order() -> list[Kernel]:

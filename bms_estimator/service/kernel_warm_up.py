@@ -9,7 +9,7 @@ from bms_estimator.estimator.estimator import Estimator, compiled_estimator
 from bms_estimator.forecast.forecaster import Forecaster
 from bms_estimator.forecast.trip import constant_trip
 from bms_estimator.kernels.accumulators.history import HISTORY_ROW
-from bms_estimator.kernels.accumulators.soc_certainty import known_rows
+from bms_estimator.kernels.accumulators.publish_window import known_rows
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, ModelWrapValidatorHandler, model_validator
 
 from bms_estimator.model.config_file import NotNegative, OneOf, Positive, Strict
-from bms_estimator.protocols.base.sensor_correction import SensorCorrection
+from bms_estimator.protocols.base.reading_protocol import SensorCorrection
 from bms_estimator.protocols.registry import BOARD, DEVICES, PROTOCOLS, max_batteries, valid_addresses
 from bms_estimator.settings.observer import BOARD_GAIN_STD
 

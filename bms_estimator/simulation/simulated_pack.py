@@ -14,7 +14,7 @@ import numpy as np
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.chen_mora import cell_step, ocv, r_s
 from bms_estimator.kernels.cell_model.fuel_cell import advance, load_file_constants, output, steady_state
-from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.kernels.observer.records import LEARNABLE
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.pack_model import FuelCellModel
 from bms_estimator.simulation.bms_responses import BMS_RESPONSES, MAX_CELLS, Measured

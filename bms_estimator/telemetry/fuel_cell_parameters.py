@@ -6,8 +6,8 @@ import numpy as np
 
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.fuel_cell import ACTIVATION, NAMES, TAFEL
+from bms_estimator.kernels.identifier import VALID_STD
 from bms_estimator.kernels.observer.series_resistance import MIN_CURRENT_C
-from bms_estimator.kernels.stability_margin import VALID_STD
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.payloads.snapshot import Parameter

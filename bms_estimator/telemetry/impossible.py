@@ -5,7 +5,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from bms_estimator.kernels.alarms.values import MAX_SUM_DIFFERENCE, MEAN_HIGH_V, MEAN_LOW_V, MILLI
+from bms_estimator.kernels.alarms.quantities import MAX_SUM_DIFFERENCE, MEAN_HIGH_V, MEAN_LOW_V, MILLI
 from bms_estimator.model.arrays import Floats
 from bms_estimator.model.pack_model import PackModel
 from bms_estimator.settings.alarm_kinds import Quantity
@@ -44,7 +44,7 @@ class PackBounds(NamedTuple):
         """Return the likely cause of an impossible value as part of a sentence, and a sentence with value and cause.
 
         Args:
-            quantity: Quantity whose value is impossible (``kernels.alarms.values.possible_values``).
+            quantity: Quantity whose value is impossible (``kernels.alarms.quantities.possible_values``).
             sample: The sample, dtype SAMPLE.
             cells_v: Its cell voltages [V]; empty if there are none.
         """

@@ -24,8 +24,8 @@ from bms_estimator.estimator.identified_parameters import (
     relative_series_resistance,
 )
 from bms_estimator.kernels.cell_model import chen_mora
+from bms_estimator.kernels.identifier import VALID_FIT_STD, VALID_STD
 from bms_estimator.kernels.kalman_filter.element_map import ELEMENT_NAMES
-from bms_estimator.kernels.stability_margin import VALID_FIT_STD, VALID_STD
 from bms_estimator.model.cell import CellModel
 from bms_estimator.model.cell_sections import TableOcv
 from bms_estimator.model.clock import iso_utc

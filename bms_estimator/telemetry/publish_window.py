@@ -13,8 +13,12 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from bms_estimator.estimator.estimator import Estimator, TraceBlock
-from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS, accumulate_charge_energy
-from bms_estimator.kernels.accumulators.publish_window import WINDOW_SUMS, accumulate_window
+from bms_estimator.kernels.accumulators.publish_window import (
+    FLOW_SUMS,
+    WINDOW_SUMS,
+    accumulate_charge_energy,
+    accumulate_window,
+)
 from bms_estimator.kernels.cell_model.current_interpolation import GAP_RATIO
 from bms_estimator.model.arrays import NO_CELLS, NO_PROBES, CellBlock, Floats, ProbeBlock, Records
 from bms_estimator.model.clock import iso_utc

@@ -10,7 +10,7 @@ import numpy as np
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.available_power import FORECAST, Forecast, unknown_values
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import Floats, ProbeBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.pack_model import PackModel

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS, Source, fit_fuel_cell
-from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
-from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.kernels.cell_model.fuel_cell import open_loop, polarisation
+from bms_estimator.kernels.observer.records import LEARNABLE
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import FuelCellModel, load_fuel_cell
 from bms_estimator.sources.captures.curves import read_polarisation

@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.kernels.kalman_filter.temperature import COOLING_S, MAX_MODELLED_C
+from bms_estimator.kernels.kalman_filter.window import COOLING_S, MAX_MODELLED_C
 from bms_estimator.model.arrays import SAMPLE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.captures.replay import load_capture

@@ -5,7 +5,7 @@ import pytest
 
 from bms_estimator.forecast.load_history import LoadHistory
 from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 
 CAPACITY_AS = 3600.0
 """Capacity of 1 Ah, so that currents in A are C-rates [A s]."""

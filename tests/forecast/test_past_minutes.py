@@ -7,7 +7,7 @@ from bms_estimator.forecast.load_history import MINUTE_S, PEAK_S, LoadHistory, P
 from bms_estimator.forecast.projection import MAX_STEPS, analogue_parts
 from bms_estimator.forecast.trip import GivenLoad
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 
 CAPACITY_AS = 3.0 * 3600.0
 MINUTES = 60

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 
 from bms_estimator.forecast.load_history import LoadHistory, PastMinutes, load_arrays, restore_load
 from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 
 CAPACITY_AS = 3.0 * 3600.0
 

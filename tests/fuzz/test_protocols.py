@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_slots import CellSlots
 from bms_estimator.protocols.base.reading_protocol import DeviceProtocol

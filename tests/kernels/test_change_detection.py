@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.cells.cell_filter import initialize_cell
-from bms_estimator.kernels.cells.change_detection import (
+from bms_estimator.kernels.cells.cell_filter import (
     END_STD,
     MIN_INFORMATION,
     THRESHOLD_STD,
     apply_changes,
+    initialize_cell,
     restart_hypothesis,
 )
 from bms_estimator.kernels.cells.records import CELL, DRAIN, FALL, HYPOTHESES, LEAK, RISE

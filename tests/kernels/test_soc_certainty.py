@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.accumulators.soc_certainty import known_rows
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.accumulators.publish_window import known_rows
+from bms_estimator.kernels.records import TRACE
 
 
 @pytest.mark.parametrize(

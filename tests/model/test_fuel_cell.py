@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.cell_model.fuel_cell import NAMES
-from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
+from bms_estimator.kernels.cell_model.fuel_cell import NAMES, polarisation
 from bms_estimator.model.cell import is_fuel_cell, load_cell, shipped_fuel_cells
 from bms_estimator.model.errors import UserError
 from bms_estimator.model.pack_model import FuelCellModel, load_fuel_cell, load_model, write_cell

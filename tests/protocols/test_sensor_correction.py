@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.protocols.base.sensor_correction import EXACT
+from bms_estimator.protocols.base.reading_protocol import EXACT
 from bms_estimator.protocols.registry import make_protocol
 from bms_estimator.settings.sensor import SensorSettings
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, make_header

@@ -12,10 +12,17 @@ import pytest
 
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.alarms.evaluate import update_alarm
-from bms_estimator.kernels.alarms.records import ALARMS as STATES, EVALUATION_IO, LIMITS, LOG, RAISED, SETTINGS
-from bms_estimator.kernels.alarms.states import acknowledge
+from bms_estimator.kernels.alarms.records import (
+    ALARMS as STATES,
+    EVALUATION_IO,
+    LIMITS,
+    LOG,
+    RAISED,
+    SETTINGS,
+    acknowledge,
+)
 from bms_estimator.kernels.cells.records import ReadingFault
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE, SampleStatus
 from bms_estimator.model.cell import CellModel, load_cell
 from bms_estimator.model.clock import iso_utc

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.telemetry.publish_window import ChargeEnergy, ChargeEnergyMeter
 
 GAP_S = 5.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.payloads.estimate import Estimate
 from bms_estimator.model.payloads.snapshot import ForecastReport

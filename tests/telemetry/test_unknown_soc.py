@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.telemetry.alarms.alarm_list import NO_VALUE

@@ -17,7 +17,7 @@ import numpy as np
 
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels.cell_model.chen_mora import PARAMETERS, delta
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import Floats, SampleBlock
 from bms_estimator.model.errors import UserError
 

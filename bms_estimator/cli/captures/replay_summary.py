@@ -11,7 +11,7 @@ from bms_estimator.estimator.cell_estimator import CellDeviations
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.estimator.identified_parameters import relative_capacity
 from bms_estimator.forecast.forecaster import Forecaster
-from bms_estimator.kernels.accumulators.soc_certainty import known_rows
+from bms_estimator.kernels.accumulators.publish_window import known_rows
 from bms_estimator.pack.pack import Pack
 from bms_estimator.telemetry.cells import CELL_COLUMNS, make_cells_payload, weakest_by_cells, weakest_cell_fields
 from bms_estimator.telemetry.health import sample_counters, suspicions

@@ -1,4 +1,4 @@
-"""Web page of a fleet: an overview, sent to browsers at a limited rate, and details of one pack on request."""
+"""Web page of a fleet: an overview, sent to browsers at a limited rate, query results, and details of one pack on request."""
 
 import asyncio
 import contextlib
@@ -8,17 +8,24 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import duckdb
 from aiohttp import web
 
 from bms_estimator.edge.subjects import PARTITIONS
 from bms_estimator.fleet.page.nats_feed import FleetFeed, Server
 from bms_estimator.fleet.page.view import FleetView
+from bms_estimator.fleet.queries.duckdb_queries import run_query
+from bms_estimator.model.errors import UserError
 from bms_estimator.page.event_stream import LatestValues
 from bms_estimator.page.page_server import STATIC as SHARED
 from bms_estimator.page.web_server import File, WebServer
 from bms_estimator.process.runtime import end_tasks
 from bms_estimator.settings.connections import PageSettings
 
+PAGE_QUERIES = ("failing", "soh", "outliers", "honest")
+"""Names of the queries on the page."""
+MAX_ROWS = 20
+"""Maximum number of rows of a result."""
 OVERVIEW_S = 2.0
 """Interval between two overviews of the fleet [s]."""
 QUERY_S = 600.0
@@ -40,6 +47,25 @@ FILES = {
     "/icon.svg": File(SHARED / "icon.svg", "image/svg+xml"),
 }
 """Served files by path."""
+
+
+def run_page_query(folder: Path, name: str) -> dict[str, Any]:
+    """Return the result of one of the queries in ``PAGE_QUERIES``.
+
+    Args:
+        folder: Folder of the hours, as ``fleet collect`` writes it.
+        name: Name of the query.
+
+    Returns:
+        ``columns``, the first ``rows``, their number (``count``), and ``notes``; or the reason why they are missing (``reason``).
+    """
+    try:
+        result = run_query(folder, name)
+    except (UserError, duckdb.Error, OSError) as error:
+        return {"reason": str(error)}
+    # the page shows only the rows of ``soh`` that are for a type; these have no pack
+    rows = [row for row in result.rows if name != "soh" or row[result.columns.index("pack")] is None]
+    return {"columns": result.columns, "rows": rows[:MAX_ROWS], "count": len(rows), "notes": result.notes}
 
 
 @contextlib.asynccontextmanager
@@ -98,7 +124,7 @@ async def _send_query_results(hours_folder: Path, latest: LatestValues) -> None:
 
     A query of a large fleet takes seconds. The process ends only after it, because a thread cannot be cancelled.
     """
-    from bms_estimator.fleet.page.query_results import PAGE_QUERIES, run_page_query  # noqa: PLC0415 - only queries need duckdb
+    from bms_estimator.fleet.page.fleet_page import PAGE_QUERIES, run_page_query  # noqa: PLC0415 - only queries need duckdb
 
     while True:
         results = {name: await asyncio.to_thread(run_page_query, hours_folder, name) for name in PAGE_QUERIES}

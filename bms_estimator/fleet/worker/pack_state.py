@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from bms_estimator.estimator.restore import copy_known_fields
 from bms_estimator.fleet.fits.messages import COMPARED
-from bms_estimator.kernels.accumulators.charge_energy import FLOW_SUMS
 from bms_estimator.kernels.accumulators.hour import HOUR_SUMS
+from bms_estimator.kernels.accumulators.publish_window import FLOW_SUMS
 from bms_estimator.kernels.alarms.records import ALARM, ALARMS
 from bms_estimator.kernels.cells.records import BANK_STATE, CELL
 from bms_estimator.kernels.kalman_filter.records import SCRATCH

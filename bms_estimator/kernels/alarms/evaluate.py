@@ -8,12 +8,17 @@ while a quantity that it needs is lost.
 
 import math
 
-from bms_estimator.kernels.accumulators.soc_certainty import is_soc_known
+from bms_estimator.kernels.accumulators.publish_window import is_soc_known
 from bms_estimator.kernels.alarms.quantities import (
     MAX_SPACING_FRACTION,
+    cell_extremes,
+    count_values,
     is_blinded,
     lost_quantities,
+    measured_values,
+    possible_values,
     step_intervals,
+    uncertain_values,
     update_quantities,
 )
 from bms_estimator.kernels.alarms.records import (
@@ -31,14 +36,8 @@ from bms_estimator.kernels.alarms.records import (
     SENSOR_FAULT,
     SOC_LOW,
     WEAK_CELL,
-)
-from bms_estimator.kernels.alarms.states import raise_now, update
-from bms_estimator.kernels.alarms.values import (
-    cell_extremes,
-    count_values,
-    measured_values,
-    possible_values,
-    uncertain_values,
+    raise_now,
+    update,
 )
 from bms_estimator.model.arrays import Floats, Record, Records, SampleStatus
 from bms_estimator.numba_cache import njit
@@ -145,7 +144,7 @@ def update_alarm(
     step_s: float,
     value: float,
 ) -> None:
-    """Process a value of alarm ``k`` that no sample contains. ``states.update`` describes the last three arguments."""
+    """Process a value of alarm ``k`` that no sample contains. ``records.update`` describes the last three arguments."""
     update(alarms[0].states[k], limits[k], settings[0], io[0], log, k, at_s, step_s, value, 0)
 
 

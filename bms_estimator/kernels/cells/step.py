@@ -10,6 +10,7 @@ from bms_estimator.kernels.cells.cell_filter import (
     CURVE_STDS,
     CURVE_WINDOWS,
     HOUR_S,
+    apply_changes,
     correct_cell,
     curve_variance,
     deviation_and_slope,
@@ -17,13 +18,10 @@ from bms_estimator.kernels.cells.cell_filter import (
     is_steep_near_full,
     noise_variance,
     predict_cell,
-    write_ph,
-)
-from bms_estimator.kernels.cells.change_detection import (
-    apply_changes,
     predict_hypotheses,
     restart_hypothesis,
     update_hypotheses,
+    write_ph,
 )
 from bms_estimator.kernels.cells.reading_faults import (
     ALIVE_V,

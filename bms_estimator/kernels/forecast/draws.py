@@ -1,4 +1,7 @@
-"""Draws (Monte Carlo samples) of pack and load.
+"""Draws (Monte Carlo samples) of pack and load, and their random numbers.
+
+The generator is splitmix64 (Steele, Lea and Flood, OOPSLA 2014), whose state is one integer, with its constants. Each draw has its
+own generator, so that it can be repeated alone.
 
 ``d`` is a record of DRAW, ``m`` of PROJECTED_PACK.
 """
@@ -9,10 +12,15 @@ import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES
 from bms_estimator.kernels.forecast.projected_pack import voltage_without_load
-from bms_estimator.kernels.forecast.random_numbers import generator_of_draw, normal, student_t
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit
 
+_INCREMENT = np.uint64(0x9E3779B97F4A7C15)
+_FIRST_FACTOR = np.uint64(0xBF58476D1CE4E5B9)
+_SECOND_FACTOR = np.uint64(0x94D049BB133111EB)
+_SHIFTS = np.uint64(30), np.uint64(27), np.uint64(31)
+_SHIFT_TO_53_BITS = np.uint64(11)
+_UNIT_OF_53_BITS = 2.0**-53
 MAX_LOAD_FACTOR = 10.0
 """Maximum factor on the load, and the inverse of the minimum. It limits the long tails of Student's t distribution."""
 
@@ -36,6 +44,43 @@ DRAW = np.dtype(
     align=True,
 )
 """Pack, load and outcome of one draw."""
+
+
+@njit(cache=True)
+def mix(state: np.uint64) -> np.uint64:
+    """Return the random integer of a generator state."""
+    z = (state ^ (state >> _SHIFTS[0])) * _FIRST_FACTOR
+    z = (z ^ (z >> _SHIFTS[1])) * _SECOND_FACTOR
+    return z ^ (z >> _SHIFTS[2])
+
+
+@njit(cache=True)
+def generator_of_draw(seed: np.uint64, draw: int) -> np.uint64:
+    """Return the initial state of the generator of one draw."""
+    return mix(seed + np.uint64(draw) * _INCREMENT)
+
+
+@njit(cache=True)
+def uniform(state: np.uint64) -> tuple[np.uint64, float]:
+    """Return the next state, and a random number above 0 and below 1."""
+    state += _INCREMENT
+    return state, (float(mix(state) >> _SHIFT_TO_53_BITS) + 0.5) * _UNIT_OF_53_BITS
+
+
+@njit(cache=True)
+def normal(state: np.uint64) -> tuple[np.uint64, float]:
+    """Return the next state, and a random number of the standard normal distribution (Box and Muller)."""
+    state, first = uniform(state)
+    state, second = uniform(state)
+    return state, math.sqrt(-2.0 * math.log(first)) * math.cos(2.0 * math.pi * second)
+
+
+@njit(cache=True)
+def student_t(state: np.uint64, degrees: float) -> tuple[np.uint64, float]:
+    """Return the next state, and a random number of Student's t distribution (Bailey, Mathematics of Computation 1994)."""
+    state, first = uniform(state)
+    state, second = uniform(state)
+    return state, math.sqrt(degrees * math.expm1(-2.0 / degrees * math.log(first))) * math.cos(2.0 * math.pi * second)
 
 
 @njit(cache=True)

@@ -8,8 +8,8 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import TAU_S
-from bms_estimator.kernels.kalman_filter.current_offset import REST_C
 from bms_estimator.kernels.kalman_filter.ekf import CHARGE_C, CHARGE_PAIR
+from bms_estimator.kernels.kalman_filter.window import REST_C
 from bms_estimator.model.arrays import Floats, Record, Records
 from bms_estimator.numba_cache import njit
 

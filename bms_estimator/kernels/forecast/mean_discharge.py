@@ -10,8 +10,8 @@ these resistances beyond those of the mean current.
 import math
 
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
-from bms_estimator.kernels.forecast.block_table import PEAK_FRACTION
 from bms_estimator.kernels.forecast.draws import loaded_voltage
+from bms_estimator.kernels.forecast.observed_load import PEAK_FRACTION
 from bms_estimator.kernels.forecast.projected_pack import grid_position, project_pack
 from bms_estimator.model.arrays import Record, Records
 from bms_estimator.numba_cache import njit

@@ -17,7 +17,6 @@ from bms_estimator.kernels.cell_model.rc_ladder import (
     REFERENCE_C,
     on_grid,
 )
-from bms_estimator.kernels.kalman_filter.current_offset import update_offset_at_rest
 from bms_estimator.kernels.kalman_filter.ekf import (
     INDEPENDENT_R_STD,
     MAX_SOC,
@@ -26,11 +25,7 @@ from bms_estimator.kernels.kalman_filter.ekf import (
     predict,
     update,
 )
-from bms_estimator.kernels.kalman_filter.gap_charge import (
-    LONG_TERM_S,
-    initialize_load_statistics,
-    update_load_statistics,
-)
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import VARYING
 from bms_estimator.kernels.kalman_filter.mixture import (
     clear_hypothesis,
     copy_hypothesis,
@@ -61,11 +56,15 @@ from bms_estimator.kernels.kalman_filter.records import (
     SOC,
     X,
 )
-from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
-from bms_estimator.kernels.kalman_filter.temperature import (
+from bms_estimator.kernels.kalman_filter.window import (
+    LONG_TERM_S,
+    initialize_load_statistics,
+    prepare_transition,
+    reset_window,
     update_arrhenius_factors,
+    update_load_statistics,
+    update_offset_at_rest,
 )
-from bms_estimator.kernels.kalman_filter.window import prepare_transition, reset_window
 from bms_estimator.model.arrays import Record
 from bms_estimator.numba_cache import njit
 

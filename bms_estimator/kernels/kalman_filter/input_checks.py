@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from bms_estimator.kernels.cell_model.rc_ladder import REFERENCE_C
-from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS
+from bms_estimator.kernels.kalman_filter.equivalent_circuit import R_S, R_TL, R_TS, VARYING
 from bms_estimator.kernels.kalman_filter.frozen_sensor import (
     FAST_S,
     FROZEN_S,
@@ -19,12 +19,10 @@ from bms_estimator.kernels.kalman_filter.frozen_sensor import (
     reference_series_resistance,
     rewind_to_freeze,
 )
-from bms_estimator.kernels.kalman_filter.gap_charge import initialize_load_statistics
 from bms_estimator.kernels.kalman_filter.hypotheses import initialize_filter, spawn_hypotheses
 from bms_estimator.kernels.kalman_filter.ocv_correction import NODE_CORRELATION, node_error_scale
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, HYPOTHESES, LN_Q, NODE, NODES, OFFSET, STATES
-from bms_estimator.kernels.kalman_filter.step_resistance import VARYING
-from bms_estimator.kernels.kalman_filter.window import reset_window
+from bms_estimator.kernels.kalman_filter.window import initialize_load_statistics, reset_window
 from bms_estimator.model.arrays import Record
 from bms_estimator.model.input_faults import InputFault
 from bms_estimator.numba_cache import njit

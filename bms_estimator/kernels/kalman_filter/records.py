@@ -165,7 +165,7 @@ WINDOW = np.dtype(
 
 STEP = np.dtype(
     [
-        ("phase", "i8"),  # VARYING, CONSTANT or STEPPED of step_resistance
+        ("phase", "i8"),  # VARYING, CONSTANT or STEPPED of detect_current_step
         ("current_a", "f8"),  # last constant current [A]
         ("voltage_v", "f8"),  # voltage at that current [V]
         ("x_a", "f8", BRANCHES),  # filtered currents of the RC pairs at that time [A]

@@ -1,4 +1,7 @@
-"""Learning law: least squares with discounting over sensitivities, for any model of ``learning_model``.
+"""Learning law: least squares with discounting over sensitivities, for each model of ``Model``.
+
+The modules ``chen_mora_sensitivity`` and ``fuel_cell`` define the functions of a model. An integer selects the model, because
+numba's disk cache cannot store first-class functions.
 
 (3.13) is an equation of the thesis, and erratum 2 is described in docs/theory/thesis.md.
 
@@ -7,19 +10,79 @@ the field ``observer`` of ``s``.
 """
 
 import math
+from enum import IntEnum
 
+from bms_estimator.kernels.cell_model import fuel_cell
 from bms_estimator.kernels.cell_model.current_interpolation import interpolated_current
-from bms_estimator.kernels.observer.learning_model import advance, load_constants, output, steady_state, write
+from bms_estimator.kernels.observer import chen_mora_sensitivity
 from bms_estimator.kernels.observer.observer import lock_transition, update_margins
-from bms_estimator.model.arrays import Record
+from bms_estimator.model.arrays import Floats, Record
 from bms_estimator.numba_cache import njit
 
+
+class Model(IntEnum):
+    """Model that is identified."""
+
+    CHEN_MORA = 0
+    FUEL_CELL = 1
+
+
+_CHEN_MORA = int(Model.CHEN_MORA)
+_FUEL_CELL = int(Model.FUEL_CELL)
+NAMES = {Model.CHEN_MORA: chen_mora_sensitivity.NAMES, Model.FUEL_CELL: fuel_cell.NAMES}
+"""Identified parameters of each model, in the order of theta."""
 LEARN_EVERY_S = 0.999
 """Minimum interval between two steps of theta [s]. Samples between them only add information."""
 MAX_RATE_HZ = 0.1
 """Maximum of gamma k [1/s]. The state k never decreases, and a theta that is faster than some 10 s follows noise."""
 RESTING_C = 0.02
 """Maximum current at which the first sample counts as one of a cell at rest, as a C-rate."""
+
+
+@njit(cache=True)
+def load_constants(model: int, constants: Floats, p: Record, soc: float, temperature_c: float) -> None:
+    """Load the model's constants for this sample; ``p`` is a record of ESTIMATOR_SETTINGS."""
+    if model == _CHEN_MORA:
+        chen_mora_sensitivity.load_constants(constants, p, soc, temperature_c)
+    elif model == _FUEL_CELL:
+        fuel_cell.load_constants(constants, p, soc, temperature_c)
+
+
+@njit(cache=True)
+def steady_state(model: int, x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float) -> None:
+    """Set states and derivatives in place to the steady state, for a sample with unknown history."""
+    if model == _CHEN_MORA:
+        chen_mora_sensitivity.steady_state(x, dx, theta, constants, current_a)
+    elif model == _FUEL_CELL:
+        fuel_cell.steady_state(x, dx, theta, constants, current_a)
+
+
+@njit(cache=True)
+def advance(model: int, x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float, dt_s: float) -> None:
+    """Advance states ``x`` (2,) [V] and derivatives ``dx`` (2, 8) in place by ``dt_s`` under a constant current."""
+    if model == _CHEN_MORA:
+        chen_mora_sensitivity.advance(x, dx, theta, constants, current_a, dt_s)
+    elif model == _FUEL_CELL:
+        fuel_cell.advance(x, dx, theta, constants, current_a, dt_s)
+
+
+@njit(cache=True)
+def output(model: int, x: Floats, dx: Floats, theta: Floats, constants: Floats, current_a: float, psi: Floats) -> float:
+    """Return the terminal voltage y^ [V]; write dy^/dtheta to ``psi`` (8,)."""
+    if model == _CHEN_MORA:
+        return chen_mora_sensitivity.output(x, dx, theta, constants, current_a, psi)
+    if model == _FUEL_CELL:
+        return fuel_cell.output(x, dx, theta, constants, current_a, psi)
+    return math.nan
+
+
+@njit(cache=True)
+def write(model: int, theta: Floats, file: Floats, a: Floats) -> None:
+    """Write the published parameters ``a`` (16,) from the file's and theta."""
+    if model == _CHEN_MORA:
+        chen_mora_sensitivity.write(theta, file, a)
+    elif model == _FUEL_CELL:
+        fuel_cell.write(theta, file, a)
 
 
 @njit(cache=True)

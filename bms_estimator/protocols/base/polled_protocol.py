@@ -10,8 +10,7 @@ from typing import Protocol
 
 from bms_estimator.model.arrays import CurrentSign
 from bms_estimator.protocols.base.reading import Reading
-from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, DeviceProtocol, ReadingProtocol
-from bms_estimator.protocols.base.sensor_correction import SensorCorrection
+from bms_estimator.protocols.base.reading_protocol import ECHO_FAULT, DeviceProtocol, ReadingProtocol, SensorCorrection
 
 BMS_GAIN_STD = 0.005
 """Relative std of the gains of a BMS. Vendors state 0.5 % for the pack voltage, and seldom a smaller error."""

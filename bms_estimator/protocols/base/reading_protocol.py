@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,28 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.protocols.base.probe_check import ProbeCheck, probe_block
 from bms_estimator.protocols.base.reading import Reading
 from bms_estimator.protocols.base.relay import Relay
-from bms_estimator.protocols.base.sensor_correction import EXACT, SensorCorrection
+
+
+class SensorCorrection(NamedTuple):
+    """Gains of voltage and current, and the zero of the current."""
+
+    voltage_gain: float = 1.0
+    """True voltage / measured voltage."""
+    current_gain: float = 1.0
+    """True current / measured current without its zero."""
+    current_zero_a: float = 0.0
+    """Measured current while no current flows, positive on discharge [A]."""
+
+    def apply(self, block: SampleBlock) -> SampleBlock:
+        """Correct the samples of a block in place, and return the block. The default correction changes no bit."""
+        if self != EXACT:
+            block["voltage_v"] *= self.voltage_gain
+            block["current_a"] = self.current_gain * (block["current_a"] - self.current_zero_a)
+        return block
+
+
+EXACT = SensorCorrection()
+"""Correction of an exact sensor."""
 
 
 @dataclass

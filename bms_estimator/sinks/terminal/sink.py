@@ -23,10 +23,10 @@ from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.mqtt.connection import Message
 from bms_estimator.mqtt.topic_cache import DeviceMessage, TopicCache
 from bms_estimator.sinks.mqtt.messages import MessageBuilder, PublishedState
-from bms_estimator.sinks.terminal.json_fields import JsonFields
 from bms_estimator.sinks.terminal.view_state import (
     ALARM_PREFIX,
     NOT_KNOWN,
+    JsonFields,
     PackView,
     ViewState,
     clock_text,

@@ -1,11 +1,13 @@
-"""State of the terminal view: last publications of the pack, and the log. No I/O."""
+"""State of the terminal view: last publications of the pack, and the log. No I/O.
+
+Other versions or publishers may send any value. ``JsonFields`` returns only values of the requested type.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.sinks.mqtt.messages import SENSOR_AVAILABILITY
-from bms_estimator.sinks.terminal.json_fields import JsonFields
 from bms_estimator.telemetry.state import clock_duration
 
 ALARM_PREFIX = "alarm/"
@@ -14,6 +16,54 @@ NOT_KNOWN = "not known"
 """Text in place of an SOC that is too uncertain."""
 BAND_STDS = 2.0
 """Half width of the SOC's confidence band [standard deviations]. The band contains the true SOC in 95 % of the cases."""
+MAX_ABS_NUMBER = 1e12
+"""Maximum absolute value of an accepted number. No quantity of a battery exceeds it, and longer text would fill a screen."""
+MAX_TEXT = 400
+"""Maximum length of a text [characters]. Longer texts are truncated."""
+
+
+class JsonFields:
+    """Fields of a JSON object. A payload of another type has no fields.
+
+    Args:
+        payload: Parsed JSON, or text.
+    """
+
+    def __init__(self, payload: object) -> None:
+        self._values = payload if isinstance(payload, dict) else {}
+
+    def __bool__(self) -> bool:
+        return bool(self._values)
+
+    def number(self, name: str) -> float | None:
+        """Return a number; None if missing."""
+        value = self._values.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > MAX_ABS_NUMBER:
+            return None
+        return float(value)
+
+    def number_text(self, name: str, format_spec: str, factor: float = 1.0) -> str:
+        """Return a number times ``factor`` as text; ``-`` if missing."""
+        value = self.number(name)
+        return "-" if value is None else f"{value * factor:{format_spec}}"
+
+    def count(self, name: str) -> int:
+        """Return an integer; 0 if missing."""
+        return int(self.number(name) or 0)
+
+    def text(self, name: str) -> str:
+        """Return a text without terminal control characters; empty if missing."""
+        return _printable(self._values.get(name))
+
+    def texts(self, name: str) -> list[str]:
+        """Return a list of texts without terminal control characters; empty if missing."""
+        values = self._values.get(name)
+        return [_printable(value) for value in values if isinstance(value, str)] if isinstance(values, list) else []
+
+    def flag(self, name: str, *, default: bool = False) -> bool:
+        """Return a boolean; ``default`` if missing."""
+        value = self._values.get(name)
+        return value if isinstance(value, bool) else default
 
 
 class PackView(NamedTuple):
@@ -74,3 +124,7 @@ def cutoff_band_text(state: JsonFields) -> str:
 def clock_text(epoch_s: float) -> str:
     """Return the time of day in UTC, ``12:00:00Z``."""
     return f"{iso_utc(epoch_s)[11:19]}Z"
+
+
+def _printable(value: object) -> str:
+    return "".join(c for c in value[:MAX_TEXT] if c.isprintable()) if isinstance(value, str) else ""

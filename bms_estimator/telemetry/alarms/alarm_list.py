@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from bms_estimator.kernels.alarms.evaluate import raise_alarm, update_alarm
 from bms_estimator.kernels.alarms.quantities import lost_quantities, update_unwatched
-from bms_estimator.kernels.alarms.records import ALARMS, COLLAPSE_RISK, NAMES, RAISED, WATCH_CHANGED
-from bms_estimator.kernels.alarms.states import acknowledge
+from bms_estimator.kernels.alarms.records import ALARMS, COLLAPSE_RISK, NAMES, RAISED, WATCH_CHANGED, acknowledge
 from bms_estimator.model.payloads.snapshot import Alarm
 from bms_estimator.settings.alarm_kinds import Quantity
 from bms_estimator.settings.alarms import AlarmName

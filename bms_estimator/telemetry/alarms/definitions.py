@@ -9,8 +9,8 @@ import numpy as np
 
 from bms_estimator.estimator.estimator import TraceBlock
 from bms_estimator.kernels.alarms.evaluate import evaluate
+from bms_estimator.kernels.alarms.quantities import BROKEN_WIRE_V
 from bms_estimator.kernels.alarms.records import EVALUATION_IO, LIMITS, LOG, NAMES, SAMPLE_ALARMS, SETTINGS
-from bms_estimator.kernels.alarms.values import BROKEN_WIRE_V
 from bms_estimator.model.arrays import CellBlock, Floats, Records, SampleBlock
 from bms_estimator.model.clock import iso_utc
 from bms_estimator.model.input_faults import InputFault

@@ -10,10 +10,9 @@ from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.forecast.forecaster import MIN_INTERVAL_S, Forecaster
 from bms_estimator.forecast.projection import DRAWS, MIN_OBSERVED_BLOCK_S
 from bms_estimator.forecast.trip import Trip, constant_trip, profile_trip
-from bms_estimator.kernels.forecast.block_table import LOAD_BLOCK, tabulate_blocks
 from bms_estimator.kernels.forecast.draws import DRAW, draw_packs
 from bms_estimator.kernels.forecast.load_seconds import MAX_LOAD_S
-from bms_estimator.kernels.forecast.observed_load import simulate_observed_load
+from bms_estimator.kernels.forecast.observed_load import LOAD_BLOCK, simulate_observed_load, tabulate_blocks
 from bms_estimator.kernels.forecast.projected_pack import PROJECTED_PACK, project_pack
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack

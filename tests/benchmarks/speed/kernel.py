@@ -12,7 +12,7 @@ import numpy as np
 
 from bms_estimator.estimator.estimator import Estimator
 from bms_estimator.kernels import step as kernel
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import SampleBlock
 from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import Pack

@@ -19,7 +19,7 @@ from bms_estimator.kernels.current_check import (
 )
 from bms_estimator.kernels.observer.mittag_leffler import SERIES_LIMIT, SERIES_TERMS, TABLE_POINTS
 from bms_estimator.kernels.observer.records import OBSERVER_SETTINGS, OBSERVER_STATE
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.arrays import SAMPLE, Records, SampleStatus
 
 SOURCE = Path(__file__).with_name("uas_step.c")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.kernels.trace import TRACE
+from bms_estimator.kernels.records import TRACE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.settings.observer import ObserverSettings
 from tests.benchmarks.load import CELL, pulses

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bms_estimator.calibration.fuel_cell_fit import KEYS
-from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
+from bms_estimator.kernels.cell_model.fuel_cell import open_loop, polarisation
 from bms_estimator.model.pack_model import load_fuel_cell, write_cell
 from tests import mann_stack
 from tests.command_line import run

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bms_estimator.kernels.cell_model.fuel_cell_open_loop import polarisation
-from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.kernels.cell_model.fuel_cell import polarisation
+from bms_estimator.kernels.observer.records import LEARNABLE
 from bms_estimator.model.pack_model import load_fuel_cell
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bms_estimator.estimator.estimator import Estimator
-from bms_estimator.kernels.kalman_filter.gap_charge import rounding_charge_variance
 from bms_estimator.kernels.kalman_filter.records import EKF_SETTINGS, EKF_STATE
+from bms_estimator.kernels.kalman_filter.window import rounding_charge_variance
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
 from bms_estimator.settings.observer import BOARD, Sampling
 from bms_estimator.settings.pack import Settings

@@ -8,10 +8,10 @@ from hypothesis import given, strategies as st
 from scipy.integrate import solve_ivp
 
 from bms_estimator.kernels.cell_model import fuel_cell
-from bms_estimator.kernels.cell_model.fuel_cell_open_loop import open_loop, polarisation
+from bms_estimator.kernels.cell_model.fuel_cell import open_loop, polarisation
 from bms_estimator.kernels.observer import chen_mora_sensitivity
-from bms_estimator.kernels.observer.learning_model import NAMES, Model
-from bms_estimator.kernels.observer.learning_records import LEARNABLE
+from bms_estimator.kernels.observer.learning_law import NAMES, Model
+from bms_estimator.kernels.observer.records import LEARNABLE
 from bms_estimator.model.pack_model import load_fuel_cell
 from tests import mann_stack
 

@@ -15,7 +15,7 @@ from bms_estimator.estimator.filter_settings import filter_settings
 from bms_estimator.estimator.settings_records import ocv_grid
 from bms_estimator.kernels.cell_model.open_loop import branch_currents
 from bms_estimator.kernels.cell_model.rc_ladder import BRANCHES, TAUS
-from bms_estimator.kernels.kalman_filter import ekf, gap_charge, hypotheses, noise as ekf_noise, temperature, window
+from bms_estimator.kernels.kalman_filter import ekf, hypotheses, noise as ekf_noise, window
 from bms_estimator.kernels.kalman_filter.mixture import merge_pair, mixture_moments, prune_and_merge
 from bms_estimator.kernels.kalman_filter.records import B_SLOW, EKF_STATE, LN_Q, LN_R, NODE, OFFSET, SOC, STATES, X
 from bms_estimator.model.arrays import SAMPLE, SampleBlock
@@ -239,7 +239,7 @@ def test_the_load_assumed_in_a_gap_after_a_peak_may_have_continued_or_ended(firs
     one_c = p["capacity_as"] / 3600.0
     s = np.zeros(1, EKF_STATE)[0]
     hypotheses.initialize_filter(s, p, 0.55, first_c * one_c, 12.0)
-    unknown_std_c = gap_charge.gap_charge_std(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
+    unknown_std_c = window.gap_charge_std(s, p, first_c * one_c, 60.0) / (60.0 * one_c)
     assert first_c - 1.29 < unknown_std_c < first_c
 
 
@@ -259,7 +259,7 @@ def test_errors_do_not_decrease_above_the_temperatures_of_the_cell_file() -> Non
     s = make_state(p)
     variances = []
     for s["temperature_c"] in (30.0, 45.0, 60.0):
-        temperature.update_arrhenius_factors(s)
+        window.update_arrhenius_factors(s)
         variances.append((ekf_noise.measurement_variance(s, p, 1.0, 5), ekf_noise.bias_variance(s, p, 0)))
     assert variances[1] == pytest.approx(1.5**2 * np.array(variances[0]), rel=0.01)
     assert variances[2] == pytest.approx(2.0**2 * np.array(variances[0]), rel=0.01)

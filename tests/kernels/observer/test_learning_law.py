@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 
 from bms_estimator.kernels.cell_model import chen_mora as elements
 from bms_estimator.kernels.observer import chen_mora_sensitivity, learning_law
-from bms_estimator.kernels.observer.learning_records import LEARNABLE, LEARNING_SETTINGS, LEARNING_STATE
+from bms_estimator.kernels.observer.records import LEARNABLE, LEARNING_SETTINGS, LEARNING_STATE
 from bms_estimator.model.cell import load_cell
 
 FILE_A = load_cell("chen_mora").a[:16]

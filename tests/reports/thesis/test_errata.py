@@ -24,7 +24,7 @@ from bms_estimator.kernels.cell_model.chen_mora import (
     r_ts,
     terminal_voltage,
 )
-from bms_estimator.kernels.observer.nussbaum import nussbaum_gain
+from bms_estimator.kernels.observer.observer import nussbaum_gain
 from bms_estimator.model.cell import load_cell
 from bms_estimator.reports.thesis import printed_pack, printed_values
 from bms_estimator.reports.thesis.errata import errata, ocv_error_ohm
