@@ -114,6 +114,7 @@ class Publisher:
         self._last_sample_s = -math.inf  # arrival of the last accepted sample, monotonic clock
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
         self._dropped_before = self._dropped_counts()  # by kind, when the last sample was accepted
+        self._is_ending = False  # True: the next snapshot is the last one
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -166,7 +167,7 @@ class Publisher:
         """Evaluate the alarms of the samples that were passed to ``add_estimates``."""
         now_s = self._clock.monotonic()
         alarm_changed = self.alarm_monitor.add(received, result, now_s, cells_fault)
-        if not self.latest and now_s >= self._due_s:
+        if not self.latest and now_s >= self._due_s and not self._pack.held_rows:
             self.publish()
         elif alarm_changed:
             self._pass_to_sinks(self.snapshot._replace(estimate=None, alarms=self.alarm_monitor.report))
@@ -200,7 +201,8 @@ class Publisher:
             sink.publish(snapshot)
 
     def publish_last(self) -> None:
-        """Publish a last snapshot with all payloads recomputed."""
+        """Publish a last snapshot with all payloads recomputed, also with an estimate that was held back."""
+        self._is_ending = True
         self._slow_sent_s = self._forecast_sent_s = self._cells_sent_s = -math.inf
         self.publish()
 
@@ -238,7 +240,8 @@ class Publisher:
     def _next_snapshot(self, now_s: float) -> Snapshot:
         """Return a snapshot with the estimate of this window. Other payloads are recomputed only when they are due."""
         _, parameters, health, info, _, forecast, cells = self.snapshot
-        summary, wall_s = self._window.take(), self._clock.wall()
+        is_held = self._pack.held_rows and not (self.latest or self._is_ending)
+        summary, wall_s = None if is_held else self._window.take(), self._clock.wall()
         estimate = self._make_estimate(summary, wall_s) if summary else None
         if summary and now_s - self._forecast_sent_s >= FORECAST_INTERVAL_S:
             self._forecast_sent_s, forecast = now_s, self._make_forecast(summary, wall_s)

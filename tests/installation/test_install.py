@@ -9,9 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.cli.settings.install import mosquitto_pub
 from bms_estimator.installation import program_copy
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.version import __version__
 from tests.command_line import PROGRAM, run
+from tests.mosquitto import PASSWORD, password_broker
 
 PACK = """
 [pack]
@@ -226,7 +229,19 @@ def test_uninstall_names_the_folders_of_the_user_and_the_command_for_home_assist
     run(capsys, "install", "--root", root, pack)
     out = run(capsys, "uninstall", "--purge", "--root", root)[1]
     assert out.endswith("Remaining: /root/.local/state/bms-estimator\n")
-    assert "mosquitto_pub -t homeassistant/device/bms_NAME/config -r -n" in out
+    login = '-h localhost -p 1883 -u house -P "$(systemd-ask-password)"'
+    assert f"\n  mosquitto_pub {login} -t homeassistant/device/bms_house/config -r -n\n" in out
+
+
+@pytest.mark.skipif(shutil.which("mosquitto_pub") is None, reason="mosquitto-clients is not installed")
+def test_the_command_for_home_assistant_logs_in_without_showing_the_password(tmp_path, monkeypatch):
+    (tmp_path / "systemd-ask-password").write_text(f"#!/bin/sh\necho '{PASSWORD}'\n")
+    (tmp_path / "systemd-ask-password").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    with password_broker(tmp_path) as broker:
+        command = mosquitto_pub(MqttSettings(url=broker.url, username="owner", password_file=tmp_path / "password"))
+        assert PASSWORD not in command
+        subprocess.run(f"{command} -t homeassistant/device/bms_house/config -r -n", shell=True, check=True)
 
 
 def test_uninstall_with_purge_leaves_nothing(root, pack, capsys):

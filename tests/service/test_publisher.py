@@ -1,5 +1,7 @@
 """Publisher: its log lines, and the times of its publications."""
 
+import math
+
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
@@ -51,6 +53,31 @@ def test_a_wrong_chemistry_is_suspected_by_the_soc_of_the_device(chemistry: str,
     now_s, samples["time_s"], samples["voltage_v"], samples["temperature_c"] = 600.0, np.arange(600), 3.3, 25.0
     publisher.add(ReceivedSamples(samples, NO_CELLS, device_soc=device_soc), pack.run(samples, device_soc=device_soc))
     assert publisher.snapshot.health.suspects == suspects
+
+
+@pytest.mark.parametrize(
+    ("device_soc", "published"),
+    [
+        ((0.6, 0.6, 0.6, 0.6), [(1.0, True), (2.0, True), (3.0, True)]),
+        ((math.nan, 0.6, 0.6, 0.6), [(2.0, True), (3.0, True)]),
+        ((math.nan, math.nan, math.nan, math.nan), [(2.0, False), (3.0, False)]),
+        ((0.6,), [(0.0, False)]),
+    ],
+)
+def test_the_first_estimate_waits_for_the_soc_of_the_device(
+    device_soc: tuple[float, ...], published: list[tuple[float, bool]]
+) -> None:
+    """The wait is limited to three samples, and to the end of the run."""
+    now_s, sink = 0.0, Collector()
+    settings = Settings.model_validate({"pack": {"cell": "lfp", "capacity_ah": 100.0, "device_soc_std": 0.1}})
+    pack, clock = new_pack(settings, load_cell("lfp", 100.0)), Clock(monotonic=lambda: now_s, wall=lambda: now_s)
+    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
+    for now_s, soc in enumerate(device_soc):
+        block, soc_block = np.array([(now_s, 0.0, 3.3, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE), np.array([soc])
+        publisher.add(ReceivedSamples(block, NO_CELLS, device_soc=soc_block), pack.run(block, device_soc=soc_block))
+    publisher.publish_last()
+    estimates = [each.estimate for each in sink.snapshots if each.estimate]
+    assert [(each.board_time_s, each.soc_known) for each in estimates] == published
 
 
 def test_a_raised_alarm_is_published_before_the_next_snapshot_is_due() -> None:

@@ -12,6 +12,7 @@ from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
 from bms_estimator.setup.new_pack import run_command
 from bms_estimator.setup.page.session import SetupSession, Step
 from bms_estimator.setup.questions import QUESTIONS, Question
+from bms_estimator.setup.search import missing_packages
 from bms_estimator.telemetry.state import UNKNOWN_SOC
 
 TITLES = {
@@ -65,7 +66,11 @@ def _search(session: SetupSession, form_key: str) -> str:
     content = (
         '<label>Where to search<textarea name="places" rows="4">' + places + "</textarea></label>"
         '<p class="note">One place per line: path of a serial port, URL of an MQTT broker (mqtt://user:password@host), host name of a '
-        "Modbus device, or bluetooth. A serial port takes up to 20 s.</p>"
+        "Modbus device, or bluetooth. A serial port takes up to 20 s."
+        + "".join(
+            f" {kind} needs a missing package: {escape(command)}." for kind, command in missing_packages().items()
+        )
+        + "</p>"
     )
     button = "Search again" if session.step is Step.DEVICE or session.error else "Search"
     return f'<section class="card">{_form("search", form_key, content, button, secondary=bool(session.result.devices))}</section>'
