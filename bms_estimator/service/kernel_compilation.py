@@ -204,7 +204,7 @@ def argument_types() -> dict[str, Any]:
     """Return the types of numba, and those of the package's structured dtypes by the names of their constants."""
     importlib.import_module("bms_estimator.service.kernel_warm_up")  # all modules with kernels
     modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("bms_estimator.")]
-    constants = [(name, value) for module in modules for name, value in vars(module).items() if name.isupper()]
+    constants = (item for module in modules for item in vars(module).items() if item[0].isupper())
     records = {name: value for name, value in constants if isinstance(value, np.dtype) and value.names}
     return vars(types) | {name: from_dtype(record) for name, record in records.items()}
 

@@ -120,9 +120,8 @@ class Publisher:
 
     def set_rate(self, rate_hz: float) -> None:
         """Set the publish rate from the next publication on [1/s]."""
-        publish = self._settings.publish.model_copy(update={"rate_hz": rate_hz})
+        publish, self.period_s = self._settings.publish.model_copy(update={"rate_hz": rate_hz}), 1.0 / rate_hz
         self._settings = self._settings.model_copy(update={"publish": publish})
-        self.period_s = 1.0 / rate_hz
         self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sensor.sample_period_s)
 
     @property
@@ -218,8 +217,7 @@ class Publisher:
         """Short text about the pack for systemd."""
         if self.snapshot.health.sensor_message:
             return f"no samples: {self.snapshot.health.sensor_message}"
-        soc = self.latest.soc if self.latest else None
-        return "" if soc is None else f"SOC {soc:.2f}"
+        return f"SOC {self.latest.soc:.2f}" if self.latest and self.latest.soc is not None else ""
 
     @property
     def not_at_rest_reason(self) -> str | None:
@@ -228,10 +226,9 @@ class Publisher:
 
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_sent_s = self._started_s
-        parameters = make_parameters_payload(self._estimator, self._started_wall_s)
         return Snapshot(
             None,
-            parameters,
+            make_parameters_payload(self._estimator, self._started_wall_s),
             self._make_health(now_s, self._sensor_message(now_s)),
             self._make_info(),
             self.alarm_monitor.report,
@@ -266,18 +263,15 @@ class Publisher:
         self._charge_energy = self._charge_energy.at_least(
             self._status.saved_charge_energy or self._totals.charge_energy
         )
-        capacity_ah = self._cell.capacity_ah
-        forecast, forecaster = self._no_forecast, self._pack.forecaster
-        if forecaster:
-            forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)
+        forecaster, no_forecast = self._pack.forecaster, self._no_forecast
         return make_state_payload(
             window,
             remaining_capacity_ah(self._estimator),
-            forecast,
+            forecaster.latest_at(window.voltage_v, window.current_a, window.power_w) if forecaster else no_forecast,
             self._source.counters,
             wall_s,
             self._charge_energy,
-            capacity_ah,
+            self._cell.capacity_ah,
             single_cell_fields(self._pack),
             self._device_soc,
         )
@@ -320,8 +314,7 @@ class Publisher:
             log.warning("suspected input faults", suspects=health.suspects or "none")
 
     def _loop_health(self) -> LoopHealth:
-        p50_s, p99_s, max_s = self._latency.pop_summary() or (None, None, None)
-        status = self._status
+        status, (p50_s, p99_s, max_s) = self._status, self._latency.pop_summary() or (None, None, None)
         return LoopHealth(
             latency_p50_s=p50_s,
             latency_p99_s=p99_s,
@@ -334,9 +327,12 @@ class Publisher:
 
     def _make_info(self) -> Info:
         self._board = self._source.board or self._board  # properties of an unplugged board remain
-        sensed = bool(self._estimator.record["filter"]["sensed"][0])
         return make_info_payload(
-            self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed
+            self._settings,
+            self._cell,
+            self._board,
+            self._started_wall_s,
+            temperature_sensor=bool(self._estimator.record["filter"]["sensed"][0]),
         )
 
     def _sensor_message(self, now_s: float) -> str | None:
@@ -349,11 +345,13 @@ class Publisher:
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
         dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped_counts().items()}
-        text = f"no usable sample for {silent_s:.1f} s"
-        text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
-        return f"{text}; {self._drop_reason}" if self._drop_reason else text
+        since = f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
+        return f"no usable sample for {silent_s:.1f} s{since}{f'; {self._drop_reason}' if self._drop_reason else ''}"
 
     def _dropped_counts(self) -> dict[str, int]:
         """Return the dropped samples by kind."""
-        counted = sample_counters(self._estimator.state[0]).items()
-        return {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}
+        return {
+            name.removeprefix("dropped_"): n
+            for name, n in sample_counters(self._estimator.state[0]).items()
+            if name.startswith("dropped_")
+        }

@@ -198,9 +198,8 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
         if "host" in address:  # a serial port is reported already
             result.failures.append(f"{name}: Modbus was not searched: {command}; {BROKER_HINT}")
         return
-    is_serial = "port" in address
+    is_serial, reasons = "port" in address, list[str]()
     profiles = [name for name, table in MODBUS_PROFILES.items() if not is_serial or "baud" in table]
-    reasons = list[str]()
     for profile in profiles:
         source = {"kind": "modbus", "profile": profile, **address}
         device = FoundDevice(
@@ -217,9 +216,8 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
                 )
             )
     if not is_serial:
-        result.failures += reasons
-        if len(reasons) == len(profiles):
-            result.failures.append(f"{name}: no Modbus device; {BROKER_HINT}")
+        none_found = [f"{name}: no Modbus device; {BROKER_HINT}"] * (len(reasons) == len(profiles))
+        result.failures += [*reasons, *none_found]
 
 
 async def _search_bluetooth(result: SearchResult) -> None:

@@ -102,8 +102,7 @@ def uninstall_command(
         remaining = uninstall(machine, purge=purge, report=_report)
     home = Path(f"~{os.environ.get('SUDO_USER', 'root')}").expanduser()
     remaining += [home / name for name in USER_FOLDERS if machine.path(home / name).exists()]
-    if program.exists():
-        remaining.append(program)
+    remaining += [program] * program.exists()
     if removals:
         typer.echo(f"\nTo remove the pack from Home Assistant:\n{removals}")
     typer.echo(f"\nRemaining: {', '.join(map(str, remaining)) or 'nothing'}")
@@ -155,7 +154,7 @@ def _machine(root: Path, command: str, arguments: Sequence[str]) -> Machine:
         UserError: The user is not root, or the directory contains no system.
     """
     if os.geteuid() != 0:
-        options = [] if root == Path("/") else [f"--root={root.resolve()}"]
+        options = [f"--root={root.resolve()}"] * (root != Path("/"))
         raise UserError(f"requires root: sudo {' '.join([str(_own_path()), command, *options, *arguments])}")
     if not root.is_dir():
         raise UserError(f"--root {root}: is not a directory")

@@ -119,9 +119,8 @@ def new(
     # the compilation takes a minute or more, in which the user answers the questions
     with background_compilation() if estimate else nullcontext() as finish_compilation, _report_interruption(file):
         prompts = Prompts(yes=yes)
-        result = _search(search_at or ([device] if device and device.startswith("/") else _places(prompts)))
-        result = _log_in(prompts, result)
-        answers = _choose_device(prompts, result, device)
+        places = search_at or ([device] if device and device.startswith("/") else _places(prompts))
+        answers = _choose_device(prompts, _log_in(prompts, _search(places)), device)
         measured = _measure(answers.device)
         meter = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
         sensor = compare_with_multimeter(prompts, answers.device, meter) if measured else ()
@@ -207,8 +206,7 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
         raise UserError("--search: no device was found; give its place: --search PLACE")
     may_search = prompts.is_interactive and device is None
     while True:
-        parse = partial(_parse_device, result=result, may_search=may_search)
-        default = "1" if len(result.choices) == 1 else ""
+        parse, default = partial(_parse_device, result=result, may_search=may_search), "1" * (len(result.choices) == 1)
         text = f"Number of the device, or another place to search ({_place_kinds()})"
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
@@ -234,8 +232,9 @@ def _log_in(prompts: Prompts, result: SearchResult) -> SearchResult:
         if not username:
             result = replace(result, login_required=others)
             continue
-        password = str(typer.prompt("Password", hide_input=True))
-        new_result = _search([BrokerLogin(login.url, username, password).address], result.devices)
+        new_result = _search(
+            [BrokerLogin(login.url, username, str(typer.prompt("Password", hide_input=True))).address], result.devices
+        )
         result = replace(
             new_result,
             broker=new_result.broker or result.broker,
@@ -255,11 +254,9 @@ def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> Found
         if text in (str(number), device.name):
             return device
     if text.isdigit() or not may_search:
-        for failure in result.failures:
-            if failure.startswith(f"{text}: "):
-                raise InvalidAnswerError(failure)
         names = ", ".join(device.name for device in result.choices) or "no device"
-        raise InvalidAnswerError(f"{text}: was not found; found: {names}")
+        failures = (failure for failure in result.failures if failure.startswith(f"{text}: "))
+        raise InvalidAnswerError(next(failures, f"{text}: was not found; found: {names}"))
     return text
 
 

@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_sections import ChenMoraOcv, TableOcv
 from tests.calibration.simulated_relaxation import INVALID_CAPTURES, relaxation
-from tests.command_line import run
+from tests.command_line import error, run
 
 
 def save(path, samples):

@@ -26,7 +26,7 @@ from bms_estimator.simulation.esphome_node import SimulatedNode
 from bms_estimator.simulation.simulated_pack import SimulatedBms
 from bms_estimator.simulation.virtual_adc import Reading
 from bms_estimator.sources.serial.device_detection import BoardClient
-from tests.command_line import PROGRAM, run
+from tests.command_line import PROGRAM, error, run
 from tests.device_line import running_device
 from tests.mosquitto import PASSWORD, Broker, password_broker
 from tests.patience import LONG_S
@@ -220,17 +220,13 @@ def test_the_service_is_installed_with_sudo(file, capsys, long_timeouts, tmp_pat
 def test_a_missing_or_wrong_option_is_named_and_nothing_is_written(file, capsys, long_timeouts, arguments, message):
     with running_device(jk_bms()) as path:
         device = [] if "--device" in arguments else ["--device", path]
-        code, _, err = run(capsys, "new", file, "--search", path, *device, *arguments)
-    assert code == 2
-    assert message in err
+        assert message in error(run(capsys, "new", file, "--search", path, *device, *arguments))
     assert not file.exists()
 
 
 def test_an_existing_file_is_not_changed(file, capsys):
     file.write_text("mine\n")
-    code, _, err = run(capsys, "new", file, "--search", "/dev/none")
-    assert code == 2
-    assert f"{file}: exists already and is not changed" in err
+    assert f"{file}: exists already and is not changed" in error(run(capsys, "new", file, "--search", "/dev/none"))
     assert file.read_text() == "mine\n"
 
 
