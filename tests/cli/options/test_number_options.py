@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.command_line import error, run
+from tests.command_line import run
 
 
 @pytest.mark.parametrize("text", ["3_9", "٣", "nan", "inf", "-inf", "0x3", "3,9", "", "1e999"])
