@@ -24,6 +24,12 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int | s
     return caught.value.code or 0, out, err
 
 
+def error(result: tuple[int | str, str, str]) -> str:
+    """Return the text on stderr of a command that ended with an error."""
+    assert result[0] == 2
+    return result[2]
+
+
 @contextlib.asynccontextmanager
 async def running_program(
     *command: object,

@@ -39,6 +39,9 @@ from bms_estimator.settings.pack import Settings
 
 PRIOR_S = 600.0
 """Time from the first sample of a new pack within which the SOC that its device reports is used as a prior [s]."""
+MAX_HELD_ROWS = 3
+"""Maximum number of rows that a new pack holds its first estimate back until the prior has an effect. A device that sends each
+value in a message of its own reports its SOC within them."""
 T = TypeVar("T")
 
 
@@ -70,6 +73,10 @@ class Pack:
         forecaster: Forecaster; None: there are no forecasts.
         has_forecasts: False: the observed load is kept, but no forecasts are made at intervals.
         device_soc_std: Std of the SOC that the device reports, which is the prior of a new pack; None: it is not used.
+
+    Attributes:
+        held_rows: Number of further rows after which the first estimate is shown. The row with the device's SOC does not
+            contain the prior, because the prior is added after it.
     """
 
     def __init__(
@@ -84,6 +91,7 @@ class Pack:
     ) -> None:
         self._device_soc_std = device_soc_std  # None also after the prior was used, or its time has passed
         self._first_s = math.nan  # time of the first sample, if the device's SOC is awaited
+        self.held_rows = MAX_HELD_ROWS if device_soc_std else 0
         self.estimator, self.slow_fit, self.cells, self.forecaster = estimator, slow_fit, cells, forecaster
         self._has_forecasts = has_forecasts and forecaster is not None
         self._has_cells = False  # of the present block
@@ -151,9 +159,10 @@ class Pack:
                 self.cells.run(samples[start:end], cells_v[start:end], trace)
             if self.slow_fit:
                 self.slow_fit.advance()
+            self.held_rows = max(self.held_rows - written, 0)
             if prior is not None and end == stop and self._device_soc_std and self.estimator.state["started"][0]:
                 self.estimator.add_prior(float(device_soc[end - 1]), self._device_soc_std)
-                self._device_soc_std = None
+                self._device_soc_std, self.held_rows = None, 1
             start, rows = end, rows + written
         return rows
 
@@ -249,7 +258,7 @@ class Pack:
         if reason := restore_state(self.estimator, state.record_fields, gap_s):
             outcomes[CHECKPOINT] = f"{REFUSED}{reason}"
             return False
-        soc, self._device_soc_std = self.estimator.soc, None
+        soc, self._device_soc_std, self.held_rows = self.estimator.soc, None, 0
         outcomes[CHECKPOINT] = "restored" if math.isnan(soc) else f"restored: SOC {soc:.4f}"
         if CAPACITY in outcomes:
             outcomes[CAPACITY] += (
@@ -281,8 +290,7 @@ def _try_convert(name: str, convert: Callable[[], T], outcomes: dict[str, str]) 
 
 def _refusal(error: Exception) -> str:
     """Return the outcome of a part whose arrays are damaged."""
-    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-    return f"{REFUSED}{kind}{error}"
+    return f"{REFUSED}{'' if isinstance(error, ValueError) else f'{type(error).__name__}: '}{error}"
 
 
 def new_pack(
@@ -338,12 +346,11 @@ def assemble(
     if has_load and estimator.has_filter:
         cell = estimator.cell.battery("the identifier is of batteries")
         forecaster = Forecaster(estimator, cutoff_v=forecast_end_v(settings, cell), limits=power_limits(settings, cell))
-    device_soc_std = settings.pack.device_soc_std if estimator.has_filter else None
     return Pack(
         estimator,
         slow_fit,
         CellEstimator(estimator),
         forecaster,
         has_forecasts=has_forecasts,
-        device_soc_std=device_soc_std,
+        device_soc_std=settings.pack.device_soc_std if estimator.has_filter else None,
     )

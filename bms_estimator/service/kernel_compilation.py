@@ -13,6 +13,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import IO, Any, NamedTuple, cast
 
@@ -50,6 +51,10 @@ class Progress(NamedTuple):
     all_cpu_s: float
 
 
+Report = Callable[[Progress], None]
+"""Function that receives the progress."""
+
+
 class Kernel(NamedTuple):
     """Kernel of the recorded order."""
 
@@ -61,8 +66,8 @@ class Kernel(NamedTuple):
 
 def compile_order() -> list[Kernel]:
     """Return the kernels in the recorded order. A kernel follows the kernels that it calls."""
-    lines = ORDER_FILE.read_text(encoding="utf-8").splitlines()
-    return [Kernel(float(seconds), call) for seconds, call in (line.split(" ", 1) for line in lines)]
+    lines = (line.split(" ", 1) for line in ORDER_FILE.read_text(encoding="utf-8").splitlines())
+    return [Kernel(float(seconds), call) for seconds, call in lines]
 
 
 def is_compiled() -> bool:
@@ -70,11 +75,12 @@ def is_compiled() -> bool:
     return CACHE_FOLDER is None or any((folder / COMPLETE_FILE).exists() for folder in (SHIPPED_FOLDER, CACHE_FOLDER))
 
 
-def compile_kernels(report: Callable[[Progress], None] = lambda _: None) -> None:
+def compile_kernels(report: Report = lambda _: None, *, in_background: bool = False) -> None:
     """Compile all kernels that are not in the cache, in as many children as CPUs and memory allow.
 
     Args:
-        report: Called with the progress, in the calling thread.
+        report: Called with the progress, in the calling thread. An exception that it raises ends the compilation.
+        in_background: True: the children have the lowest priority, and write nothing to stderr.
 
     Raises:
         TemporaryError: The children end early.
@@ -84,7 +90,7 @@ def compile_kernels(report: Callable[[Progress], None] = lambda _: None) -> None
     order = compile_order()
     pending, done = deque(order), list[Kernel]()
     count = max(1, min(len(os.sched_getaffinity(0)), available_bytes() // CHILD_BYTES))
-    compilers = [_Compiler(pending, done) for _ in range(count)]
+    compilers = [_Compiler(pending, done, in_background=in_background) for _ in range(count)]
     try:
         for compiler in compilers:
             compiler.start()
@@ -103,12 +109,39 @@ def compile_kernels(report: Callable[[Progress], None] = lambda _: None) -> None
     (CACHE_FOLDER / COMPLETE_FILE).touch()
 
 
+@contextlib.contextmanager
+def background_compilation() -> Iterator[Callable[[Report], None]]:
+    """Compile the kernels in the background, for example while a user answers questions, until the context ends.
+
+    Yields:
+        Function that waits for the end of the compilation, with the argument and the exception of ``compile_kernels``. A
+        compilation that failed in the background is repeated.
+    """
+    reports: list[Report] = [lambda _: None]
+    with ThreadPoolExecutor(1) as executor:
+        compiling = executor.submit(
+            compile_kernels,
+            lambda progress: reports[-1](progress),  # noqa: PLW0108 - the last one at the time of the call
+            in_background=True,
+        )
+
+        def finish(report: Report) -> None:
+            reports.append(report)
+            wait([compiling])
+            compile_kernels(report)
+
+        try:
+            yield finish
+        finally:
+            reports.clear()  # the IndexError at the next report ends the compilation
+
+
 class _Compiler(threading.Thread):
     """Thread that passes kernels to one child after the other."""
 
-    def __init__(self, pending: deque[Kernel], done: list[Kernel]) -> None:
+    def __init__(self, pending: deque[Kernel], done: list[Kernel], *, in_background: bool) -> None:
         super().__init__(daemon=True)
-        self._pending, self._done = pending, done
+        self._pending, self._done, self._prefix = pending, done, ("nice", "-n19") if in_background else ()
         self._lock, self._stopped = threading.Lock(), False
         self._child: subprocess.Popen[str] | None = None
 
@@ -148,9 +181,10 @@ class _Compiler(threading.Thread):
             if self._stopped:
                 return None
             self._child = subprocess.Popen(  # noqa: S603 - this module
-                [sys.executable, "-P", "-m", __name__, str(MAX_CHILD_BYTES)],
+                [*self._prefix, sys.executable, "-P", "-m", __name__, str(MAX_CHILD_BYTES)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL if self._prefix else None,
                 text=True,
                 start_new_session=True,  # Ctrl-C in the terminal ends only this process, which ends its children
             )
@@ -170,7 +204,7 @@ def argument_types() -> dict[str, Any]:
     """Return the types of numba, and those of the package's structured dtypes by the names of their constants."""
     importlib.import_module("bms_estimator.service.kernel_warm_up")  # all modules with kernels
     modules = [module for name, module in sorted(sys.modules.items()) if name.startswith("bms_estimator.")]
-    constants = [(name, value) for module in modules for name, value in vars(module).items() if name.isupper()]
+    constants = (item for module in modules for item in vars(module).items() if item[0].isupper())
     records = {name: value for name, value in constants if isinstance(value, np.dtype) and value.names}
     return vars(types) | {name: from_dtype(record) for name, record in records.items()}
 

@@ -117,15 +117,14 @@ class Publisher:
         self._drop_logged_s = -math.inf
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
         self._dropped_before = self._dropped_counts()  # by kind, when the last sample was accepted
+        self._is_ending = False  # True: the next snapshot is the last one
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
     def set_rate(self, rate_hz: float) -> None:
         """Set the publish rate from the next publication on [1/s]."""
-        self._settings = self._settings.model_copy(
-            update={"publish": self._settings.publish.model_copy(update={"rate_hz": rate_hz})}
-        )
-        self.period_s = 1.0 / rate_hz
+        publish, self.period_s = self._settings.publish.model_copy(update={"rate_hz": rate_hz}), 1.0 / rate_hz
+        self._settings = self._settings.model_copy(update={"publish": publish})
         self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sensor.sample_period_s)
 
     @property
@@ -173,7 +172,7 @@ class Publisher:
         """Evaluate the alarms of the samples that were passed to ``add_estimates``."""
         now_s = self._clock.monotonic()
         alarm_changed = self.alarm_monitor.add(received, result, now_s, cells_fault)
-        if not self.latest and now_s >= self._due_s:
+        if not self.latest and now_s >= self._due_s and not self._pack.held_rows:
             self.publish()
         elif alarm_changed:
             self._pass_to_sinks(self.snapshot._replace(estimate=None, alarms=self.alarm_monitor.report))
@@ -207,7 +206,8 @@ class Publisher:
             sink.publish(snapshot)
 
     def publish_last(self) -> None:
-        """Publish a last snapshot with all payloads recomputed."""
+        """Publish a last snapshot with all payloads recomputed, also with an estimate that was held back."""
+        self._is_ending = True
         self._slow_sent_s = self._forecast_sent_s = self._cells_sent_s = -math.inf
         self.publish()
 
@@ -223,8 +223,7 @@ class Publisher:
         """Short text about the pack for systemd."""
         if self.snapshot.health.sensor_message:
             return f"no samples: {self.snapshot.health.sensor_message}"
-        soc = self.latest.soc if self.latest else None
-        return "" if soc is None else f"SOC {soc:.2f}"
+        return f"SOC {self.latest.soc:.2f}" if self.latest and self.latest.soc is not None else ""
 
     @property
     def not_at_rest_reason(self) -> str | None:
@@ -244,7 +243,8 @@ class Publisher:
     def _next_snapshot(self, now_s: float) -> Snapshot:
         """Return a snapshot with the estimate of this window. Other payloads are recomputed only when they are due."""
         _, parameters, health, info, _, forecast, cells = self.snapshot
-        summary, wall_s = self._window.take(), self._clock.wall()
+        is_held = self._pack.held_rows and not (self.latest or self._is_ending)
+        summary, wall_s = None if is_held else self._window.take(), self._clock.wall()
         estimate = self._make_estimate(summary, wall_s) if summary else None
         if summary and now_s - self._forecast_sent_s >= FORECAST_INTERVAL_S:
             self._forecast_sent_s, forecast = now_s, self._make_forecast(summary, wall_s)
@@ -269,18 +269,15 @@ class Publisher:
         self._charge_energy = self._charge_energy.at_least(
             self._status.saved_charge_energy or self._totals.charge_energy
         )
-        capacity_ah = self._cell.capacity_ah
-        forecast, forecaster = self._no_forecast, self._pack.forecaster
-        if forecaster:
-            forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)
+        forecaster, no_forecast = self._pack.forecaster, self._no_forecast
         return make_state_payload(
             window,
             remaining_capacity_ah(self._estimator),
-            forecast,
+            forecaster.latest_at(window.voltage_v, window.current_a, window.power_w) if forecaster else no_forecast,
             self._source.counters,
             wall_s,
             self._charge_energy,
-            capacity_ah,
+            self._cell.capacity_ah,
             single_cell_fields(self._pack),
             self._device_soc,
         )
@@ -323,8 +320,7 @@ class Publisher:
             log.warning("suspected input faults", suspects=health.suspects or "none")
 
     def _loop_health(self) -> LoopHealth:
-        p50_s, p99_s, max_s = self._latency.pop_summary() or (None, None, None)
-        status = self._status
+        status, (p50_s, p99_s, max_s) = self._status, self._latency.pop_summary() or (None, None, None)
         return LoopHealth(
             latency_p50_s=p50_s,
             latency_p99_s=p99_s,
@@ -355,9 +351,8 @@ class Publisher:
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
         dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped_counts().items()}
-        text = f"no usable sample for {silent_s:.1f} s"
-        text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
-        return f"{text}; {self._drop_reason}" if self._drop_reason else text
+        since = f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
+        return f"no usable sample for {silent_s:.1f} s{since}{f'; {self._drop_reason}' if self._drop_reason else ''}"
 
     def _dropped_counts(self) -> dict[str, int]:
         """Return the dropped samples by kind."""

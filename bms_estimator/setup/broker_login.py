@@ -50,8 +50,8 @@ class BrokerLogin:
 
     def settings(self, password_file: Path | str) -> dict[str, object]:
         """Return the settings of the broker. With a password they contain the path ``password_file``."""
-        values = {"url": self.url, "username": self.username}
-        values["password_file"] = None if self.password is None else str(password_file)
+        file = None if self.password is None else str(password_file)
+        values = {"url": self.url, "username": self.username, "password_file": file}
         return {key: value for key, value in values.items() if value is not None}
 
     @property

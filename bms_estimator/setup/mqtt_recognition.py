@@ -154,20 +154,14 @@ def _device(
     publisher: Publisher, values: Mapping[str, float], broker: BrokerLogin, *, only_changes: bool
 ) -> FoundDevice:
     profile = PROFILES[publisher.profile]
-    source: dict[str, object] = {"kind": "mqtt", "profile": publisher.profile}
-    for key in ("prefix", "instance"):
-        value = getattr(publisher, key)
-        if value and value != profile.table.get(key):
-            source[key] = value
-    if only_changes:
-        source["max_silent_s"] = MAX_SILENT_S
+    address = {"prefix": publisher.prefix, "instance": publisher.instance}
+    address = {key: value for key, value in address.items() if value and value != profile.table.get(key)}
+    source: dict[str, object] = {"kind": "mqtt", "profile": publisher.profile, **address}
+    source |= {"max_silent_s": MAX_SILENT_S} if only_changes else {}
     sign = 1.0 if profile.current_sign == DISCHARGE else -1.0
-    name = NAME_SEPARATOR.join(
-        str(part) for part in (publisher.profile, source.get("prefix"), source.get("instance")) if part
-    )
     cells = int(is_live(np.array([v for key, v in values.items() if key.startswith("cell ")])).sum())
     return FoundDevice(
-        name=name,
+        name=NAME_SEPARATOR.join((publisher.profile, *address.values())),
         description=f"{MqttSource.model_validate(source).short_description}, {broker.url}",
         tables={"source": source},
         cells=cells or None,

@@ -32,6 +32,15 @@ BROKER_HINT = "a broker is searched by mqtt://HOST:PORT"
 """Hint for a place without mqtt://, which is searched as a Modbus device."""
 BLUETOOTH = "bluetooth"
 """Place that represents all Bluetooth devices nearby."""
+MODBUS = "Modbus host"
+"""Kind of place that represents a host name of a Modbus device."""
+PLACES = ("serial port", "mqtt://host", MODBUS, BLUETOOTH)
+"""Kinds of places to search."""
+OPTIONAL_PACKAGES = {
+    MODBUS: ("pymodbus", "pip install 'bms_estimator[modbus]'"),
+    BLUETOOTH: ("aiobmsble", "pip install 'bms_estimator[ble]' (Python 3.12 or later)"),
+}
+"""Packages that some kinds of places need, and the commands that install them."""
 DEFAULT_BROKER = str(MqttSettings.model_fields["url"].default)
 """URL of the broker that is searched by default."""
 
@@ -54,9 +63,21 @@ class SearchResult:
         return with_pairs(self.devices)
 
 
+def missing_packages() -> dict[str, str]:
+    """Return the commands that install missing packages, by the kinds of places that cannot be searched without them."""
+    return {
+        kind: command
+        for kind, (package, command) in OPTIONAL_PACKAGES.items()
+        if importlib.util.find_spec(package) is None
+    }
+
+
 def default_places() -> list[str]:
-    """Return the places that are searched by default: ports that may belong to a board or BMS, a local broker, Bluetooth."""
-    return [*board_ports(), DEFAULT_BROKER, BLUETOOTH]
+    """Return the places that are searched by default: ports that may belong to a board or BMS, a local broker, Bluetooth.
+
+    Bluetooth is not one of them if its package is missing.
+    """
+    return [*board_ports(), DEFAULT_BROKER, *({BLUETOOTH} - missing_packages().keys())]
 
 
 async def search(places: Sequence[str]) -> SearchResult:
@@ -78,10 +99,9 @@ async def _search_or_report(place: str, result: SearchResult) -> None:
     """Search a place, and add an exception to the failures."""
     try:
         await _search_place(place, result)
-    except UserError as error:  # names the place
-        result.failures.append(str(error))
     except Exception as error:  # noqa: BLE001 - one place must not end the search of the others
-        result.failures.append(f"{without_secrets(place)}: cannot be searched: {type(error).__name__}: {error}")
+        text = f"{without_secrets(place)}: cannot be searched: {type(error).__name__}: {error}"
+        result.failures.append(str(error) if isinstance(error, UserError) else text)  # a UserError names the place
 
 
 async def _search_place(place: str, result: SearchResult) -> None:
@@ -143,17 +163,16 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
                         message = await connection.receive()
                         recognition.add_message(message.topic, message.payload, retained=message.retain)
     except LoginError:
-        reason = "requires a user name and a password" if login.username is None else "user name or password wrong"
-        result.failures.append(f"{url}: {reason}; give them as {url.replace('://', '://user:pw@')}")
+        reason = "requires a user name and a password"
+        result.failures.append(f"{url}: {reason if login.username is None else 'user name or password wrong'}")
         result.login_required.append(login)
-        return
     except BrokerConnectionError as error:
         result.failures.append(f"{url}: {error}")
-        return
-    found = recognition.devices(login)
-    result.devices += found
-    if not found:
-        result.failures.append(f"{url}: no message of a known publisher within {LISTEN_DURATION_S:g} s")
+    else:
+        found = recognition.devices(login)
+        result.devices += found
+        if not found:
+            result.failures.append(f"{url}: no message of a known publisher within {LISTEN_DURATION_S:g} s")
 
 
 async def _search_modbus_host(place: str, result: SearchResult) -> None:
@@ -175,15 +194,12 @@ async def _search_modbus_host(place: str, result: SearchResult) -> None:
 
 
 async def _search_modbus(address: dict[str, object], name: str, result: SearchResult) -> None:
-    if importlib.util.find_spec("pymodbus") is None:
+    if command := missing_packages().get(MODBUS):
         if "host" in address:  # a serial port is reported already
-            result.failures.append(
-                f"{name}: Modbus was not searched: pip install 'bms_estimator[modbus]'; {BROKER_HINT}"
-            )
+            result.failures.append(f"{name}: Modbus was not searched: {command}; {BROKER_HINT}")
         return
-    is_serial = "port" in address
+    is_serial, reasons = "port" in address, list[str]()
     profiles = [name for name, table in MODBUS_PROFILES.items() if not is_serial or "baud" in table]
-    reasons = list[str]()
     for profile in profiles:
         source = {"kind": "modbus", "profile": profile, **address}
         device = FoundDevice(
@@ -200,15 +216,14 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
                 )
             )
     if not is_serial:
-        result.failures += reasons
-        if len(reasons) == len(profiles):
-            result.failures.append(f"{name}: no Modbus device; {BROKER_HINT}")
+        none_found = [f"{name}: no Modbus device; {BROKER_HINT}"] * (len(reasons) == len(profiles))
+        result.failures += [*reasons, *none_found]
 
 
 async def _search_bluetooth(result: SearchResult) -> None:
     """Find BMS by their Bluetooth advertisements, if the optional package is installed."""
-    if importlib.util.find_spec("aiobmsble") is None:
-        result.failures.append("Bluetooth: not searched: pip install 'bms_estimator[ble]' (Python 3.12 or later)")
+    if command := missing_packages().get(BLUETOOTH):
+        result.failures.append(f"Bluetooth: not searched: {command}")
         return
     from bms_estimator.sources.bluetooth.client import discover  # noqa: PLC0415 - needs an optional package
 
@@ -217,8 +232,11 @@ async def _search_bluetooth(result: SearchResult) -> None:
     except UserError as error:
         result.failures.append(f"Bluetooth: {error}")
         return
-    for bms in found:
-        source = {"kind": "ble", "address": bms.address}
-        result.devices.append(FoundDevice(bms.address, f"Bluetooth BMS {bms.name}, {bms.kind}", {"source": source}))
+    result.devices += [
+        FoundDevice(
+            bms.address, f"Bluetooth BMS {bms.name}, {bms.kind}", {"source": {"kind": "ble", "address": bms.address}}
+        )
+        for bms in found
+    ]
     if not found:
         result.failures.append("Bluetooth: no BMS advertises")

@@ -9,13 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from bms_estimator.cli.settings.install import mosquitto_pub
 from bms_estimator.installation import program_copy
 from bms_estimator.installation.install import require_stopped
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import instance_lock
 from bms_estimator.settings.pack import Settings
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.version import __version__
-from tests.command_line import PROGRAM, run
+from tests.command_line import PROGRAM, error, run
+from tests.mosquitto import PASSWORD, password_broker
 
 PACK = """
 [pack]
@@ -131,8 +134,7 @@ def test_other_settings_and_another_password_are_backed_up_for_root_and_the_serv
 def test_settings_of_another_pack_are_not_replaced_and_the_error_has_the_commands_for_both(root, pack, capsys):
     run(capsys, "install", "--root", root, pack)
     pack.write_text(PACK.replace("house", "shed"))
-    code, _, err = run(capsys, "install", "--root", root, pack)
-    assert code == 2
+    err = error(run(capsys, "install", "--root", root, pack))
     assert "has the settings of the pack house" in err
     assert f"sudo install -m 640 -g bms-estimator {pack} /etc/bms-estimator/shed.toml" in err
     assert "sudo systemctl enable --now bms-estimator@shed" in err
@@ -146,9 +148,7 @@ def test_a_symbolic_link_in_place_of_a_file_is_rejected(root, pack, capsys, tmp_
     other_file.write_text("root:hash")
     (tmp_path / place).unlink()
     (tmp_path / place).symlink_to(other_file)
-    code, _, err = run(capsys, "install", "--root", root, pack)
-    assert code == 2
-    assert f"{tmp_path / place}: is a symbolic link" in err
+    assert f"{tmp_path / place}: is a symbolic link" in error(run(capsys, "install", "--root", root, pack))
     assert other_file.read_text() == "root:hash"
     assert not any(
         path.read_bytes() == b"root:hash"
@@ -159,9 +159,7 @@ def test_a_symbolic_link_in_place_of_a_file_is_rejected(root, pack, capsys, tmp_
 
 def test_invalid_settings_change_nothing(root, pack, capsys):
     pack.write_text(PACK.replace("series = 4", "series = 0"))
-    code, _, err = run(capsys, "install", "--root", root, pack)
-    assert code == 2
-    assert "pack.series = 0" in err
+    assert "pack.series = 0" in error(run(capsys, "install", "--root", root, pack))
     assert list((root / "etc").iterdir()) == []
 
 
@@ -210,9 +208,9 @@ def test_copied_packages_include_their_programs_without_scripts(tmp_path):
 
 def test_a_root_directory_without_etc_is_rejected_and_stays_empty(root, pack, capsys):
     (root / "etc").rmdir()
-    code, _, err = run(capsys, "install", "--root", root, pack)
-    assert code == 2
-    assert f"--root {root}: is not the root directory of a system" in err
+    assert f"--root {root}: is not the root directory of a system" in error(
+        run(capsys, "install", "--root", root, pack)
+    )
     assert list(root.iterdir()) == []
 
 
@@ -243,7 +241,19 @@ def test_uninstall_names_the_folders_of_the_user_and_the_command_for_home_assist
     run(capsys, "install", "--root", root, pack)
     out = run(capsys, "uninstall", "--purge", "--root", root)[1]
     assert out.endswith("Remaining: /root/.local/state/bms-estimator\n")
-    assert "mosquitto_pub -t homeassistant/device/bms_NAME/config -r -n" in out
+    login = '-h localhost -p 1883 -u house -P "$(systemd-ask-password)"'
+    assert f"\n  mosquitto_pub {login} -t homeassistant/device/bms_house/config -r -n\n" in out
+
+
+@pytest.mark.skipif(shutil.which("mosquitto_pub") is None, reason="mosquitto-clients is not installed")
+def test_the_command_for_home_assistant_logs_in_without_showing_the_password(tmp_path, monkeypatch):
+    (tmp_path / "systemd-ask-password").write_text(f"#!/bin/sh\necho '{PASSWORD}'\n")
+    (tmp_path / "systemd-ask-password").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    with password_broker(tmp_path) as broker:
+        command = mosquitto_pub(MqttSettings(url=broker.url, username="owner", password_file=tmp_path / "password"))
+        assert PASSWORD not in command
+        subprocess.run(f"{command} -t homeassistant/device/bms_house/config -r -n", shell=True, check=True)
 
 
 def test_uninstall_with_purge_leaves_nothing(root, pack, capsys):
@@ -261,8 +271,7 @@ def test_uninstall_without_an_installation_changes_nothing(root, capsys):
 def test_without_root_the_error_has_the_whole_command(pack, capsys, monkeypatch):
     monkeypatch.setattr("os.geteuid", lambda: 1000)
     monkeypatch.setattr("sys.argv", [str(PROGRAM)])
-    code, _, err = run(capsys, "install", pack)
-    assert code == 2
+    err = error(run(capsys, "install", pack))
     assert err == f"error: requires root: sudo {PROGRAM.resolve()} install {pack}\n"
 
 
@@ -273,9 +282,9 @@ def test_link_that_leads_out_of_the_root_directory_is_rejected(root, pack, capsy
     shutil.rmtree(settings)
     outside.mkdir()
     settings.symlink_to(outside)
-    code, _, err = run(capsys, command, "--root", root, *([pack] if command == "install" else []))
-    assert code == 2
-    assert "a symbolic link leads out of" in err
+    assert "a symbolic link leads out of" in error(
+        run(capsys, command, "--root", root, *([pack] if command == "install" else []))
+    )
     assert list(outside.iterdir()) == []
 
 
@@ -283,6 +292,4 @@ def test_link_that_leads_out_of_the_root_directory_is_rejected(root, pack, capsy
 def test_a_file_in_place_of_a_folder_or_a_folder_in_place_of_a_file_is_an_error(root, pack, capsys, name):
     (root / name).parent.mkdir(parents=True)
     (root / name).touch()
-    code, _, err = run(capsys, "install", "--root", root, pack)
-    assert code == 2
-    assert str(root / name.removesuffix("/folder")) in err
+    assert str(root / name.removesuffix("/folder")) in error(run(capsys, "install", "--root", root, pack))

@@ -11,6 +11,7 @@ from bms_estimator.model.errors import TemporaryError
 from bms_estimator.service import kernel_compilation
 from bms_estimator.service.kernel_compilation import (
     Progress,
+    background_compilation,
     compile_kernels,
     compile_order,
     is_compiled,
@@ -83,6 +84,19 @@ def test_each_child_ends_at_its_limit_and_the_next_one_continues(cache: Path, mo
     assert reports[-1].all_kernels == 2
     compile_kernels(reports.append)
     assert len(started) == 2
+
+
+def test_a_compilation_in_the_background_is_finished_with_its_progress(cache: Path) -> None:
+    reports = list[Progress]()
+    with background_compilation() as finish:
+        finish(reports.append)
+    assert (is_compiled(), reports[-1].all_kernels) == (True, 2)
+
+
+def test_a_compilation_that_fails_in_the_background_is_repeated(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with background_compilation() as finish, pytest.raises(TemporaryError, match="the compiler ended 3 times"):
+        finish(lambda _: None)
 
 
 def test_a_compiler_that_is_killed_is_an_error_that_names_the_memory(

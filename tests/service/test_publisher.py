@@ -1,5 +1,8 @@
 """Publisher: its log lines, and the times of its publications."""
 
+import math
+from collections.abc import Iterable
+
 import numpy as np
 import pytest
 from structlog.testing import capture_logs
@@ -9,12 +12,29 @@ from bms_estimator.model.arrays import NO_CELLS, SAMPLE
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.clock import Clock
 from bms_estimator.model.input_faults import InputFault
+from bms_estimator.model.payloads.snapshot import Snapshot
 from bms_estimator.pack.pack import Pack, new_pack
 from bms_estimator.service.publisher import Publisher
 from bms_estimator.settings.pack import Settings
 from bms_estimator.sources.source import ReceivedSamples
 from bms_estimator.telemetry.health import DEVICE_SOC_SUSPICION
 from tests.scripted_source import Collector, ScriptedSource
+
+
+def publish(settings: Settings, pack: Pack, rows: Iterable[tuple[float, ...]]) -> tuple[Publisher, list[Snapshot]]:
+    """Publish the estimates of samples: time [s], current [A], voltage [V], and optionally the SOC by the device.
+
+    Returns:
+        The publisher, and the list of its snapshots.
+    """
+    now_s, sink = 0.0, Collector()
+    clock = Clock(monotonic=lambda: now_s)
+    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
+    for now_s, current_a, voltage_v, *soc in rows:
+        block = np.array([(now_s, current_a, voltage_v, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
+        received = ReceivedSamples(block, NO_CELLS, device_soc=np.array(soc))
+        publisher.add(received, pack.run(block, device_soc=received.device_soc))
+    return publisher, sink.snapshots
 
 
 def test_suspected_input_faults_are_logged_when_their_set_changes() -> None:
@@ -45,57 +65,56 @@ def test_suspected_input_faults_are_logged_when_their_set_changes() -> None:
 def test_a_wrong_chemistry_is_suspected_by_the_soc_of_the_device(chemistry: str, suspects: list[str]) -> None:
     """The samples are those of an LFP cell at rest for ten minutes, whose device reports 60 %."""
     settings = Settings.model_validate({"pack": {"cell": chemistry, "capacity_ah": 100.0, "device_soc_std": 0.1}})
-    now_s, samples, device_soc = 0.0, np.zeros(600, SAMPLE), np.full(600, 0.6)
-    pack = new_pack(settings, load_cell(chemistry, 100.0))
-    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[], clock=Clock(monotonic=lambda: now_s))
-    now_s, samples["time_s"], samples["voltage_v"], samples["temperature_c"] = 600.0, np.arange(600), 3.3, 25.0
-    publisher.add(ReceivedSamples(samples, NO_CELLS, device_soc=device_soc), pack.run(samples, device_soc=device_soc))
+    rows = ((float(time_s), 0.0, 3.3, 0.6) for time_s in range(600))
+    publisher, _ = publish(settings, new_pack(settings, load_cell(chemistry, 100.0)), rows)
     assert publisher.snapshot.health.suspects == suspects
 
 
+@pytest.mark.parametrize(
+    ("device_soc", "published"),
+    [
+        ((0.6, 0.6, 0.6, 0.6), [(1.0, True), (2.0, True), (3.0, True)]),
+        ((math.nan, 0.6, 0.6, 0.6), [(2.0, True), (3.0, True)]),
+        ((math.nan, math.nan, math.nan, math.nan), [(2.0, False), (3.0, False)]),
+        ((0.6,), [(0.0, False)]),
+    ],
+)
+def test_the_first_estimate_waits_for_the_soc_of_the_device(
+    device_soc: tuple[float, ...], published: list[tuple[float, bool]]
+) -> None:
+    """The wait is limited to three samples, and to the end of the run."""
+    settings = Settings.model_validate({"pack": {"cell": "lfp", "capacity_ah": 100.0, "device_soc_std": 0.1}})
+    rows = ((float(time_s), 0.0, 3.3, soc) for time_s, soc in enumerate(device_soc))
+    publisher, snapshots = publish(settings, new_pack(settings, load_cell("lfp", 100.0)), rows)
+    publisher.publish_last()
+    assert [(each.estimate.board_time_s, each.estimate.soc_known) for each in snapshots if each.estimate] == published
+
+
 def test_a_raised_alarm_is_published_before_the_next_snapshot_is_due() -> None:
-    now_s, cell, sink = 0.0, load_cell("chen_mora"), Collector()
     settings = Settings.model_validate({"publish": {"rate_hz": 0.1}, "alarms": {"pack_over_voltage": {"delay_s": 0.0}}})
-    estimator = Estimator(cell, initial_soc=0.5)
-    clock = Clock(monotonic=lambda: now_s)
-    pack = Pack(estimator)
-    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
-    for now_s, voltage_v in ((0.0, 3.8), (1.0, 3.8), (2.0, 6.0), (3.0, 6.0)):
-        block = np.array([(now_s, 0.0, voltage_v, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-        publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
-    raised_alarms = [[alarm.name for alarm in each.alarms if alarm.active] for each in sink.snapshots]
+    rows = [(0.0, 0.0, 3.8), (1.0, 0.0, 3.8), (2.0, 0.0, 6.0), (3.0, 0.0, 6.0)]
+    _, snapshots = publish(settings, Pack(Estimator(load_cell("chen_mora"), initial_soc=0.5)), rows)
+    raised_alarms = [[alarm.name for alarm in each.alarms if alarm.active] for each in snapshots]
     assert raised_alarms == [[], ["pack_over_voltage"]]
     # the second snapshot has no estimate, because the publish window has not ended
-    assert [each.estimate is None for each in sink.snapshots] == [False, True]
+    assert [each.estimate is None for each in snapshots] == [False, True]
 
 
 def test_an_estimate_that_is_due_is_published_before_the_alarm_of_the_same_sample() -> None:
-    now_s, cell, sink = 0.0, load_cell("chen_mora"), Collector()
     limits = {"pack_over_voltage": {"limit_v": 4.0, "clear_v": 3.9, "delay_s": 0.0}}
     settings = Settings.model_validate({"publish": {"rate_hz": 1.0}, "alarms": limits})
-    estimator = Estimator(cell, initial_soc=0.5)
-    clock = Clock(monotonic=lambda: now_s)
-    pack = Pack(estimator)
-    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
-    for now_s, voltage_v in ((0.0, 3.8), (1.0, 4.05)):
-        block = np.array([(now_s, 0.0, voltage_v, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-        publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
+    pack = Pack(Estimator(load_cell("chen_mora"), initial_soc=0.5))
+    _, snapshots = publish(settings, pack, [(0.0, 0.0, 3.8), (1.0, 0.0, 4.05)])
     assert [
-        (each.estimate and each.estimate.voltage_v, any(alarm.active for alarm in each.alarms))
-        for each in sink.snapshots
+        (each.estimate and each.estimate.voltage_v, any(alarm.active for alarm in each.alarms)) for each in snapshots
     ] == [(3.8, False), (4.05, False), (None, True)]
 
 
 def test_the_curves_of_a_forecast_are_published_once_a_minute() -> None:
-    now_s, cell, sink = 0.0, load_cell("chen_mora"), Collector()
     settings = Settings.model_validate({"publish": {"rate_hz": 0.1}, "pack": {"initial_soc": 0.5}})
-    pack = new_pack(settings, cell)
-    clock = Clock(monotonic=lambda: now_s)
-    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
-    for now_s in np.arange(0.0, 181.0, 10.0):
-        block = np.array([(now_s, 0.1, 3.8, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-        publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
-    reports = [each.forecast for each in sink.snapshots if each.forecast]
+    rows = ((10.0 * number, 0.1, 3.8) for number in range(19))
+    _, snapshots = publish(settings, new_pack(settings, load_cell("chen_mora")), rows)
+    reports = [each.forecast for each in snapshots if each.forecast]
     assert len({id(report) for report in reports}) == 4  # at 0, 60, 120 and 180 s
     assert reports[0].cutoff_v == pytest.approx(2.7)  # default limit of the alarm pack_under_voltage
 
@@ -103,16 +122,11 @@ def test_the_curves_of_a_forecast_are_published_once_a_minute() -> None:
 @pytest.mark.parametrize(("current_a", "direction"), [(9.0, "discharge"), (-6.0, "charge")])
 def test_no_published_available_power_is_below_the_present_power(current_a: float, direction: str) -> None:
     """The load rises to 3 C, and the charge to 2 C, after a forecast that assumes less."""
-    now_s, cell, sink = 0.0, load_cell("nmc", 3.0), Collector()
     limits = {"charge_over_current": {"limit_a": 10.0}}
     settings = Settings.model_validate({"alarms": limits, "pack": {"initial_soc": 0.5}})
-    pack, clock = new_pack(settings, cell), Clock(monotonic=lambda: now_s)
-    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=clock)
-    for now_s in range(40):
-        present_a = current_a if now_s > 35 else 0.0
-        block = np.array([(now_s, present_a, 3.7 - 0.03 * present_a, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-        publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
-    estimate = sink.snapshots[-1].estimate
+    pack, currents_a = new_pack(settings, load_cell("nmc", 3.0)), [0.0] * 36 + [current_a] * 4
+    rows = ((float(time_s), each_a, 3.7 - 0.03 * each_a) for time_s, each_a in enumerate(currents_a))
+    estimate = publish(settings, pack, rows)[1][-1].estimate
     assert estimate
     names = [f"available_{direction}_power_{seconds}s_w" for seconds in (10, 60)]
     assert pack.forecaster
@@ -121,13 +135,9 @@ def test_no_published_available_power_is_below_the_present_power(current_a: floa
 
 
 def test_a_pack_without_the_identifier_has_no_forecast_and_a_reason() -> None:
-    cell, sink = load_cell("chen_mora"), Collector()
     settings = Settings.model_validate({"identifier": {"enabled": False}, "pack": {"initial_soc": 0.5}})
-    pack = new_pack(settings, cell)
+    pack = new_pack(settings, load_cell("chen_mora"))
     assert pack.forecaster is None
-    publisher = Publisher(settings, pack, source=ScriptedSource(), sinks=[sink], clock=Clock())
-    block = np.array([(0.0, 0.1, 3.8, 25.0, 25.0, 25.0, 0)], dtype=SAMPLE)
-    publisher.add(ReceivedSamples(block, NO_CELLS), pack.run(block))
-    [snapshot] = sink.snapshots
+    [snapshot] = publish(settings, pack, [(0.0, 0.1, 3.8)])[1]
     assert snapshot.estimate
     assert (snapshot.estimate.forecast_reason, snapshot.forecast) == ("the identifier is switched off", None)

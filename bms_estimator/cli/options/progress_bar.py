@@ -4,7 +4,7 @@ Only a first start compiles kernels, for about a minute on two idle cores. Later
 """
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 
 import typer
@@ -27,36 +27,45 @@ COMPILE_LABEL = "compiling kernels"
 
 def new_bar(console: Console) -> Progress:
     """Return a bar that disappears at its end. It writes nothing if the console is not a terminal."""
-    columns = (
+    return Progress(
         TextColumn("{task.description}"),
         BarColumn(BAR_WIDTH),
         TaskProgressColumn(),
         TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
     )
-    return Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
 
 
-def compile_ahead(report: Callable[[str], object] | None = None) -> None:
+def compile_ahead(
+    report: Callable[[str], object] | None = None,
+    compile_all: Callable[[kernel_compilation.Report], None] = compile_kernels,
+) -> None:
     """Compile all kernels that are not in the cache. Announce it, and show a bar with the number of kernels and the time left.
 
     Args:
         report: Called with ``COMPILE_TEXT``; default: write to stderr.
+        compile_all: Compiles the kernels, or waits until they are compiled; called with a function that receives the progress.
 
     Raises:
         TemporaryError: The memory is not sufficient.
     """
     if is_compiled():
         return
-    console = Console(stderr=True)
     (report or partial(typer.echo, err=True))(COMPILE_TEXT)
-    with new_bar(console) as bar:
+    with new_bar(Console(stderr=True)) as bar:
         task = bar.add_task(COMPILE_LABEL, total=None)
 
         def update(progress: kernel_compilation.Progress) -> None:
-            label = f"{COMPILE_LABEL}: {progress.kernels} of {progress.all_kernels}"
-            bar.update(task, description=label, total=progress.all_cpu_s, completed=progress.cpu_s)
+            bar.update(
+                task,
+                description=f"{COMPILE_LABEL}: {progress.kernels} of {progress.all_kernels}",
+                total=progress.all_cpu_s,
+                completed=progress.cpu_s,
+            )
 
-        compile_kernels(update)
+        compile_all(update)
 
 
 MIN_CHANGE = 0.001
@@ -97,8 +106,5 @@ def progress_bar(label: str) -> Iterator[ProgressBar]:
     console = Console(stderr=True)
     with new_bar(console) as progress:
         bar = ProgressBar(label, progress)
-        if not console.is_terminal:
-            yield bar
-            return
-        with event.install_listener("numba:compile", bar):
+        with event.install_listener("numba:compile", bar) if console.is_terminal else nullcontext():
             yield bar

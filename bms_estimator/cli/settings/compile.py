@@ -17,5 +17,4 @@ def compile_command() -> None:
     if CACHE_FOLDER is None:
         raise UserError("no folder for compiled kernels can be written: set NUMBA_CACHE_DIR=FOLDER")
     compile_ahead()
-    is_shipped = (SHIPPED_FOLDER / COMPLETE_FILE).exists()
-    typer.echo(f"compiled kernels: {SHIPPED_FOLDER if is_shipped else CACHE_FOLDER}")
+    typer.echo(f"compiled kernels: {SHIPPED_FOLDER if (SHIPPED_FOLDER / COMPLETE_FILE).exists() else CACHE_FOLDER}")

@@ -1,9 +1,10 @@
 """``bms-estimator install`` and ``uninstall``: the service on this machine."""
 
 import os
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -29,7 +30,10 @@ from bms_estimator.installation.program_copy import (
     system_python,
 )
 from bms_estimator.model.errors import UserError
+from bms_estimator.mqtt.connection import parse_url
+from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.pack import load_settings
+from bms_estimator.sinks.home_assistant.discovery import discovery_topic
 from bms_estimator.version import __version__
 
 USER_FOLDERS = (USER_STATE, ".cache/bms_estimator")
@@ -70,7 +74,7 @@ def install_command(
         require_stopped(
             load_settings(paths.PACK_FILE),
             _user_home(),
-            (hand_command if machine.lacks_systemd else f"systemctl restart {paths.NAME}"),
+            hand_command if machine.lacks_systemd else f"systemctl restart {paths.NAME}",
         )
     if machine.has_running_systemd and not no_start:
         if may_start:
@@ -105,17 +109,42 @@ def uninstall_command(
 ) -> None:
     """Stop and remove the service, its user, systemd units and udev rule. Settings and state remain. Requires root."""
     machine = _machine(root, "uninstall", ["--purge"] if purge else [])
-    program, has_settings = _own_path(), machine.path(paths.PACK_FILE).exists()
+    program, removals = _own_path(), _home_assistant_removals(machine)
     with _errors_of_files():
         remaining = uninstall(machine, purge=purge, report=_report)
     remaining += [path for path in (_user_home() / name for name in USER_FOLDERS) if machine.path(path).exists()]
-    if program.exists():
-        remaining.append(program)
-    if has_settings:
-        typer.echo(
-            "\nTo remove a pack from Home Assistant: mosquitto_pub -t homeassistant/device/bms_NAME/config -r -n"
-        )
+    remaining += [program] * program.exists()
+    if removals:
+        typer.echo(f"\nTo remove the pack from Home Assistant:\n{removals}")
     typer.echo(f"\nRemaining: {', '.join(map(str, remaining)) or 'nothing'}")
+
+
+def _home_assistant_removals(machine: Machine) -> str:
+    """Return the commands that remove the installed packs from Home Assistant, one a line; empty without a broker."""
+    commands = list[str]()
+    for file in sorted(machine.path(paths.SETTINGS).glob("*.toml")):
+        with suppress(UserError):  # a file of other or invalid settings
+            settings = load_settings(file)
+            if settings.mqtt and settings.home_assistant.enabled:
+                commands.append(
+                    f"  {mosquitto_pub(settings.mqtt)} -t {discovery_topic(settings.home_assistant, settings.pack.name)} -r -n"
+                )
+    return "\n".join(commands)
+
+
+def mosquitto_pub(mqtt: MqttSettings) -> str:
+    """Return a shell command that publishes to the first broker. It asks for the password."""
+    broker = parse_url(mqtt.urls[0])
+    values = {"-h": broker.host, "-p": broker.port, "-u": mqtt.username, "--cafile": mqtt.ca_file}
+    values |= {"--cert": mqtt.cert_file, "--key": mqtt.key_file or mqtt.cert_file}
+    return " ".join(
+        (
+            "mosquitto_pub",
+            *(f"{option} {shlex.quote(str(value))}" for option, value in values.items() if value),
+            *(["--tls-use-os-certs"] if broker.tls and not mqtt.ca_file else []),
+            *(['-P "$(systemd-ask-password)"'] if mqtt.password_file else []),
+        )
+    )
 
 
 @contextmanager
@@ -136,7 +165,7 @@ def _machine(root: Path, command: str, arguments: Sequence[str]) -> Machine:
         UserError: The user is not root, or the directory contains no system.
     """
     if os.geteuid() != 0:
-        options = [] if root == Path("/") else [f"--root={root.resolve()}"]
+        options = [f"--root={root.resolve()}"] * (root != Path("/"))
         raise UserError(f"requires root: sudo {' '.join([str(_own_path()), command, *options, *arguments])}")
     if not root.is_dir():
         raise UserError(f"--root {root}: is not a directory")

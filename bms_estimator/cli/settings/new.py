@@ -5,7 +5,7 @@ import shlex
 import subprocess
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from bms_estimator.installation.machine import root_command
 from bms_estimator.model.config_file import without_secrets
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import configure_logs
+from bms_estimator.service.kernel_compilation import background_compilation
 from bms_estimator.service.kernel_warm_up import load_kernels
 from bms_estimator.settings.pack import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError
@@ -31,10 +32,8 @@ from bms_estimator.setup.found_device import FoundDevice
 from bms_estimator.setup.measurement import Measurement, measure
 from bms_estimator.setup.new_pack import create_pack, run_command
 from bms_estimator.setup.questions import QUESTIONS, Question
-from bms_estimator.setup.search import SearchResult, default_places, search
+from bms_estimator.setup.search import PLACES, SearchResult, default_places, missing_packages, search
 
-PLACES = "serial port, mqtt://host, Modbus host, bluetooth"
-"""Kinds of places to search."""
 ESTIMATE_S = 5.0
 """Time over which the first estimates are shown [s]."""
 
@@ -45,7 +44,7 @@ def new(
         list[str] | None,
         typer.Option(
             "--search",
-            help="where to search: path of a serial port, URL of an MQTT broker (mqtt://user:pw@host), host name of a Modbus device, or bluetooth; may be repeated; default: asked on a terminal, otherwise all USB serial ports, the MQTT broker on this machine, Bluetooth",
+            help="where to search: path of a serial port, URL of an MQTT broker (mqtt://user:pw@host), host name of a Modbus device, or bluetooth; may be repeated; default: asked on a terminal, otherwise all USB serial ports, the MQTT broker on this machine, and Bluetooth if its package is installed",
             show_default=False,
         ),
     ] = None,
@@ -117,29 +116,27 @@ def new(
     """
     require_new(file)
     configure_logs(deque[str](maxlen=1))  # the wizard reports faults itself
-    with _report_interruption(file):
+    # the compilation takes a minute or more, in which the user answers the questions
+    with background_compilation() if estimate else nullcontext() as finish_compilation, _report_interruption(file):
         prompts = Prompts(yes=yes)
-        result = _search(search_at or ([device] if device and device.startswith("/") else _places(prompts)))
-        result = _log_in(prompts, result)
-        answers = _choose_device(prompts, result, device)
+        places = search_at or ([device] if device and device.startswith("/") else _places(prompts))
+        answers = _choose_device(prompts, _log_in(prompts, _search(places)), device)
         measured = _measure(answers.device)
-        options = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
-        sensor = compare_with_multimeter(prompts, answers.device, options) if measured else ()
+        meter = MultimeterOptions(compare, voltmeter_v, zero, ammeter_a, direction)
+        sensor = compare_with_multimeter(prompts, answers.device, meter) if measured else ()
         answers = replace(answers, measured=measured, name=file.stem, sensor=sensor)
-        limits = (full_voltage_v, cutoff_voltage_v, max_discharge_a, max_charge_a)
         # in the order of ``QUESTIONS``, like the help texts above
-        given = (name, cell, capacity_ah, series, parallel, *limits, device_soc_std, broker)
-        for question, option in zip(QUESTIONS, given, strict=True):
+        given = (name, cell, capacity_ah, series, parallel, full_voltage_v, cutoff_voltage_v, max_discharge_a)
+        for question, option in zip(QUESTIONS, (*given, max_charge_a, device_soc_std, broker), strict=True):
             if option is not None or question.is_asked(answers):
                 answers = _ask(prompts, question, option, answers)
         pack = create_pack(file, answers)
         for warning in pack.warnings:
             typer.echo(f"warning: {warning}", err=True)
-        typer.echo(f"{file}: written; {pack.summary}")
-        for path in pack.password_files:
-            typer.echo(f"{path}: written, mode 600; password for the broker")
-        if estimate and measured:
-            compile_ahead()
+        passwords = (f"{path}: written, mode 600; password for the broker" for path in pack.password_files)
+        typer.echo("\n".join((f"{file}: written; {pack.summary}", *passwords)))
+        if finish_compilation and measured:
+            compile_ahead(compile_all=finish_compilation)
             load_kernels()
             asyncio.run(
                 run_estimator(
@@ -173,8 +170,10 @@ def _places(prompts: Prompts) -> list[str]:
     places = " ".join(default_places())
     if "/dev/" not in places:
         typer.echo("-  no USB serial port is connected; --search PATH searches another serial port")
+    for kind, command in missing_packages().items():
+        typer.echo(f"-  {kind}: not searched, because a package is missing: {command}")
     return prompts.ask(
-        f"Where to search ({PLACES})",
+        f"Where to search ({_place_kinds()})",
         "--search",
         None if prompts.is_interactive else places,
         str.split,
@@ -182,16 +181,18 @@ def _places(prompts: Prompts) -> list[str]:
     )
 
 
+def _place_kinds() -> str:
+    """Return the kinds of places that can be searched."""
+    return ", ".join(kind for kind in PLACES if kind not in missing_packages())
+
+
 def _search(places: Sequence[str], earlier: Sequence[FoundDevice] = ()) -> SearchResult:
     """Search the places, and print what was found, after the devices that were found earlier."""
     with show_status(f"searching {', '.join(map(without_secrets, places))}: up to 20 s"):
         result = asyncio.run(search(places))
-    names = [device.name for device in earlier]
-    result.devices = [*earlier, *(device for device in result.devices if device.name not in names)]
-    for number, device in enumerate(result.choices, start=1):
-        typer.echo(f"{number}  {device.name}: {device}")
-    for failure in result.failures:
-        typer.echo(f"-  {failure}")
+    result.devices = list({device.name: device for device in (*earlier, *result.devices)}.values())
+    found = (f"{number}  {device.name}: {device}" for number, device in enumerate(result.choices, start=1))
+    typer.echo("\n".join((*found, *(f"-  {failure}" for failure in result.failures))))
     return result
 
 
@@ -203,11 +204,10 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
     """
     if not result.devices and device is None and not prompts.is_interactive:
         raise UserError("--search: no device was found; give its place: --search PLACE")
-    text = f"Number of the device, or another place to search ({PLACES})"
     may_search = prompts.is_interactive and device is None
     while True:
-        parse = partial(_parse_device, result=result, may_search=may_search)
-        default = "1" if len(result.choices) == 1 else ""
+        parse, default = partial(_parse_device, result=result, may_search=may_search), "1" * (len(result.choices) == 1)
+        text = f"Number of the device, or another place to search ({_place_kinds()})"
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
             return Answers(chosen, found_broker=result.broker)
@@ -216,17 +216,25 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
 
 
 def _log_in(prompts: Prompts, result: SearchResult) -> SearchResult:
-    """Ask for the login of each broker that requires one, and search the broker again, until the login is right or empty."""
-    while result.login_required and prompts.is_interactive:
+    """Ask for the login of each broker that requires one, and search the broker again, until the login is right or empty.
+
+    Without a terminal, print how to give the login.
+    """
+    while result.login_required:
         login, *others = result.login_required
+        if not prompts.is_interactive:
+            typer.echo(f"-  give the login as {login.url.replace('://', '://user:pw@')}")
+            break
+        typer.echo(f"   You are asked for both{' again' if login.username else ''}.")
         username = str(
             typer.prompt(f"User name at {login.url} (empty: skip this broker)", default="", show_default=False)
         )
         if not username:
             result = replace(result, login_required=others)
             continue
-        password = str(typer.prompt("Password", hide_input=True))
-        new_result = _search([BrokerLogin(login.url, username, password).address], result.devices)
+        new_result = _search(
+            [BrokerLogin(login.url, username, str(typer.prompt("Password", hide_input=True))).address], result.devices
+        )
         result = replace(
             new_result,
             broker=new_result.broker or result.broker,
@@ -246,11 +254,9 @@ def _parse_device(text: str, result: SearchResult, *, may_search: bool) -> Found
         if text in (str(number), device.name):
             return device
     if text.isdigit() or not may_search:
-        for failure in result.failures:
-            if failure.startswith(f"{text}: "):
-                raise InvalidAnswerError(failure)
         names = ", ".join(device.name for device in result.choices) or "no device"
-        raise InvalidAnswerError(f"{text}: was not found; found: {names}")
+        failures = (failure for failure in result.failures if failure.startswith(f"{text}: "))
+        raise InvalidAnswerError(next(failures, f"{text}: was not found; found: {names}"))
     return text
 
 
@@ -285,14 +291,11 @@ def _offer_install(prompts: Prompts, file: Path, given: bool | None) -> None:
     """Install the service, or print the commands that run and install it.
 
     Raises:
-        typer.Exit: The installation failed.
+        typer.Exit: The installation ended, with its exit code.
     """
     command = root_command("install", file)
     if prompts.confirm(
         "Install the service, which runs at each start of this machine?", "--install", given, default=False
     ):
-        code = subprocess.run(command, check=False).returncode  # noqa: S603 - the program of this process
-        if code:
-            raise typer.Exit(code)
-        return
+        raise typer.Exit(subprocess.run(command, check=False).returncode)  # noqa: S603 - the program of this process
     typer.echo(f"run it here: {run_command(file)}\ninstall the service: {shlex.join(command)}")

@@ -12,6 +12,7 @@ from bms_estimator.setup.multimeter import CHARGING, DISCHARGING
 from bms_estimator.setup.new_pack import run_command
 from bms_estimator.setup.page.session import SetupSession, Step
 from bms_estimator.setup.questions import QUESTIONS, Question
+from bms_estimator.setup.search import missing_packages
 from bms_estimator.telemetry.state import UNKNOWN_SOC
 
 TITLES = {
@@ -65,7 +66,11 @@ def _search(session: SetupSession, form_key: str) -> str:
     content = (
         '<label>Where to search<textarea name="places" rows="4">' + places + "</textarea></label>"
         '<p class="note">One place per line: path of a serial port, URL of an MQTT broker (mqtt://user:password@host), host name of a '
-        "Modbus device, or bluetooth. A serial port takes up to 20 s.</p>"
+        "Modbus device, or bluetooth. A serial port takes up to 20 s."
+        + "".join(
+            f" {kind} needs a missing package: {escape(command)}." for kind, command in missing_packages().items()
+        )
+        + "</p>"
     )
     button = "Search again" if session.step is Step.DEVICE or session.error else "Search"
     return f'<section class="card">{_form("search", form_key, content, button, secondary=bool(session.result.devices))}</section>'
@@ -134,8 +139,8 @@ def _done(session: SetupSession, _: str) -> str:
         return ""
     warnings = f"<ul class='bad'>{_items(session.pack.warnings)}</ul>" if session.pack.warnings else ""
     install, run = escape(shlex.join(root_command("install", session.file))), escape(run_command(session.file))
-    capacity_ah = session.pack.cell.cell.capacity_ah
-    note = current_note(session.measured.current_a, capacity_ah) if session.measured else ""
+    cell, measured = session.pack.cell.cell, session.measured
+    note = current_note(measured.current_a, cell.capacity_ah) if measured else ""
     return (
         '<section class="card"><h2>State of charge</h2><div id="known"><p class="huge"><b data-q="soc">&nbsp;</b>'
         '<small>%</small></p><p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p></div>'

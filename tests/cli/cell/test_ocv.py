@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from bms_estimator.model.cell import load_cell
 from bms_estimator.model.cell_sections import ChenMoraOcv, TableOcv
 from tests.calibration.simulated_relaxation import INVALID_CAPTURES, relaxation
-from tests.command_line import run
+from tests.command_line import error, run
 
 
 def save(path, samples):
@@ -152,26 +152,23 @@ def test_implausible_voltage_is_rejected(distort, options, message, tmp_path, ca
 
 def test_capture_is_not_overwritten(captures, capsys):
     before = captures[0].read_bytes()
-    code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0], "--force")
-    assert code == 2
-    assert "is also an input" in err
+    assert "is also an input" in error(
+        run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", captures[0], "--force")
+    )
     assert captures[0].read_bytes() == before
 
 
 def test_missing_output_folder_is_an_error(captures, tmp_path, capsys):
-    code, _, err = run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", tmp_path / "no" / "c.toml")
-    assert code == 2
+    err = error(run(capsys, "ocv", captures[0], "--capacity-ah", "3", "--out", tmp_path / "no" / "c.toml"))
     assert "Traceback" not in err
-    code, _, err = run(capsys, "ocv", tmp_path / "absent.csv", "--capacity-ah", "3", "--out", tmp_path / "c.toml")
-    assert code == 2
+    err = error(run(capsys, "ocv", tmp_path / "absent.csv", "--capacity-ah", "3", "--out", tmp_path / "c.toml"))
     assert "absent.csv" in err
 
 
 def test_empty_capture_is_an_error(tmp_path, capsys):
     empty = tmp_path / "empty.csv"
     empty.write_text("time_s,current_a,voltage_v\n")
-    code, _, err = run(capsys, "ocv", empty, "--capacity-ah", "3", "--out", tmp_path / "c.toml")
-    assert code == 2
+    err = error(run(capsys, "ocv", empty, "--capacity-ah", "3", "--out", tmp_path / "c.toml"))
     assert "Traceback" not in err
     assert "empty.csv" in err
 
@@ -189,9 +186,7 @@ def test_sign_of_the_current_is_an_option(tmp_path, capsys):
     samples = relaxation()
     samples["current_a"] *= -1.0
     arguments = ("ocv", save(tmp_path / "charge.csv", samples), "--capacity-ah", "3", "--out", tmp_path / "c.toml")
-    code, _, err = run(capsys, *arguments)
-    assert code == 2
-    assert "discharge must be positive (--current-sign)" in err
+    assert "discharge must be positive (--current-sign)" in error(run(capsys, *arguments))
     assert run(capsys, *arguments, "--current-sign", "charge_positive")[0] == 0
     assert "20 rests of charge.csv" in (tmp_path / "c.toml").read_text()
 
@@ -272,9 +267,9 @@ def test_unpaired_slow_curve_of_a_layered_oxide_is_corrected(tmp_path, capsys, d
 def test_curve_that_falls_to_0_v_is_rejected(tmp_path, capsys, shared_data):
     """With a declared capacity of 4 Ah instead of 2.9 Ah, the points end far from empty."""
     capture = shared_data / "panasonic18650pf" / "25_hppc.csv.gz"
-    code, _, err = run(capsys, "ocv", capture, "--capacity-ah", "4", "--out", tmp_path / "large.toml")
-    assert code == 2
-    assert "at SOC 0: give captures down to empty; if the cell was emptied, the capacity of 4 Ah is too large" in err
+    assert "at SOC 0: give captures down to empty; if the cell was emptied, the capacity of 4 Ah is too large" in error(
+        run(capsys, "ocv", capture, "--capacity-ah", "4", "--out", tmp_path / "large.toml")
+    )
     assert not (tmp_path / "large.toml").exists()
 
 

@@ -11,7 +11,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.process.state_folder import instance_lock, state_folder
 from bms_estimator.service.live_loop import run_estimation_loop
 from bms_estimator.settings.pack import Settings, load_settings
-from tests.command_line import run
+from tests.command_line import error, run
 from tests.scripted_source import ScriptedSource
 
 SETTINGS = """
@@ -66,9 +66,7 @@ def test_a_pack_moves_to_another_machine_with_its_settings_and_all_that_it_has_l
     assert saved_soc(load_settings(moved)) == soc
     names = {each.name for each in (moved.parent / "state/bms-estimator").iterdir()}
     assert names == {each.name for each in (pack.parent / "state/bms-estimator").iterdir()} - {alike.name}
-    code, _, err = run(capsys, "restore", archive, moved)
-    assert code == 2
-    assert "the pack has a state already" in err
+    assert "the pack has a state already" in error(run(capsys, "restore", archive, moved))
 
 
 def test_a_running_service_and_another_pack_are_refused(pack, tmp_path, capsys):
@@ -101,6 +99,5 @@ def test_a_damaged_archive_is_refused(pack, tmp_path, capsys, position):
     content = bytearray(archive.read_bytes())
     content[position : position + 8 or None] = b"\xff" * 8
     archive.write_bytes(content)
-    code, _, err = run(capsys, "restore", archive, tmp_path / "second.toml")
-    assert code == 2
+    err = error(run(capsys, "restore", archive, tmp_path / "second.toml"))
     assert err.startswith(f"error: {archive}: ")
