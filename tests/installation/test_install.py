@@ -14,8 +14,8 @@ from bms_estimator.installation import program_copy
 from bms_estimator.installation.install import require_stopped
 from bms_estimator.model.errors import UserError
 from bms_estimator.process.state_folder import instance_lock
-from bms_estimator.settings.pack import Settings
 from bms_estimator.settings.connections import MqttSettings
+from bms_estimator.settings.pack import Settings
 from bms_estimator.version import __version__
 from tests.command_line import PROGRAM, error, run
 from tests.mosquitto import PASSWORD, password_broker
