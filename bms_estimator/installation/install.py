@@ -5,7 +5,6 @@ import shutil
 import subprocess
 import tomllib
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,17 +47,16 @@ def system_files(machine: Machine, program: Path) -> list[SystemFile]:
     """
     unit = (FILES / "bms-estimator.service").read_text(encoding="utf-8").replace(UNIT_PROGRAM, str(program))
     template = unit.replace(str(paths.PACK_FILE), f"{paths.SETTINGS}/%i.toml")
+    rule = (FILES / "99-bms-estimator.rules").read_text(encoding="utf-8")
     files = [
         SystemFile("unit", paths.UNIT, unit),
         SystemFile("unit", paths.TEMPLATE, template),
-        SystemFile("udev rule", paths.UDEV_RULE, (FILES / "99-bms-estimator.rules").read_text(encoding="utf-8")),
+        SystemFile("udev rule", paths.UDEV_RULE, rule),
     ]
     # where these daemons set the clock, the drop-in allows the service to ask the kernel whether it is synchronized
     if any(machine.path(daemon).exists() for daemon in paths.CLOCK_DAEMONS):
-        files += [
-            SystemFile("unit", paths.clock_drop_in(unit), (FILES / "clock.conf").read_text(encoding="utf-8"))
-            for unit in (paths.UNIT, paths.TEMPLATE)
-        ]
+        drop_in = (FILES / "clock.conf").read_text(encoding="utf-8")
+        files += [SystemFile("unit", paths.clock_drop_in(unit), drop_in) for unit in (paths.UNIT, paths.TEMPLATE)]
     return files
 
 
@@ -194,7 +192,8 @@ def reload_system() -> None:
 
 def _link_program(machine: Machine, program: Path, report: Report) -> None:
     """Link the program from the search path of root, unless a program of this name is there."""
-    if any((folder / paths.NAME).exists() for folder in map(machine.path, paths.SEARCH_PATH.split(":"))):
+    folders = [machine.path(folder) for folder in paths.SEARCH_PATH.split(":")]
+    if any((folder / paths.NAME).exists() for folder in folders):
         return
     link = machine.path(paths.PROGRAM_LINK)
     link.parent.mkdir(parents=True, exist_ok=True)
@@ -255,7 +254,8 @@ def _set_settings_group(machine: Machine, group: int) -> None:
 
 
 def _is_enabled(machine: Machine) -> bool:
-    return any((folder / paths.UNIT.name).is_symlink() for folder in machine.path(paths.UNIT).parent.glob("*.wants"))
+    folders = machine.path(paths.UNIT).parent.glob("*.wants")
+    return any((folder / paths.UNIT.name).is_symlink() for folder in folders)
 
 
 def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
@@ -286,8 +286,7 @@ def uninstall(machine: Machine, *, purge: bool, report: Report) -> list[Path]:
     for name in user_data if purge else ():
         _remove(machine, name, report)
     for folder in drop_ins:
-        with suppress(OSError):  # it is absent, or has files of the user
-            machine.path(folder).rmdir()
+        _remove_if_empty(machine.path(folder))
     if machine.has_running_systemd:
         reload_system()
     for name in user_data:
@@ -320,6 +319,11 @@ def _remove_user(machine: Machine, report: Report) -> None:
     if machine.group_id(paths.NAME) is not None:
         machine.run("groupdel", paths.NAME, root_option="--prefix")
     report("removed", f"user {paths.NAME}")
+
+
+def _remove_if_empty(folder: Path) -> None:
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def _give_to_root(folder: Path) -> None:

@@ -14,7 +14,8 @@ from bms_estimator.model.errors import UserError
 
 def root_command(*arguments: str | Path) -> list[str]:
     """Return the command that runs this program as root, with its full path, because sudo does not search a virtual environment."""
-    return ["sudo", str(Path(sys.executable).with_name(paths.NAME)), *map(str, arguments)]
+    program = Path(sys.executable).with_name(paths.NAME)
+    return ["sudo", str(program), *map(str, arguments)]
 
 
 _LINK_ERROR = "{}: is a symbolic link, which may lead to another user's file; replace it with the file"

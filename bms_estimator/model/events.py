@@ -69,23 +69,17 @@ def events(before: Snapshot | None, snapshot: Snapshot) -> list[Event]:
     """
     health = snapshot.health
     if before is None:
+        started = EventText("start", f"checkpoint: {health.checkpoint}")
         # at the start ``health.unseen_s`` is the gap between the runs; None: no gap, or an unknown length
-        texts = [
-            EventText("start", f"checkpoint: {health.checkpoint}"),
-            *_gap_event(health.unseen_s or 0.0),
-            *_sensor_events(None, health),
-        ]
+        texts = [started, *_gap_event(health.unseen_s or 0.0), *_sensor_events(None, health)]
         texts += [*input_fault_events([], health.suspects), *_checkpoint_events("", health)]
     elif before.health is health:
         texts = []
     else:
         previous = before.health
         # the total counts all gaps since the previous snapshot; ``health.unseen_s`` is only the last gap
-        texts = [
-            *_gap_event(health.total.unseen_s - previous.total.unseen_s),
-            *_sensor_events(previous, health),
-            *input_fault_events(previous.suspects, health.suspects),
-        ]
+        gaps = _gap_event(health.total.unseen_s - previous.total.unseen_s)
+        texts = [*gaps, *_sensor_events(previous, health), *input_fault_events(previous.suspects, health.suspects)]
         texts += _checkpoint_events(previous.checkpoint, health)
         texts += soc_events(previous.identifier, health.identifier, health.anchor)
         texts += _fit_events(previous, health)

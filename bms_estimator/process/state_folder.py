@@ -57,7 +57,7 @@ def write_private(path: Path, content: bytes | memoryview) -> None:
     """
     new_path = path.with_suffix(".new")
     new_path.unlink(missing_ok=True)  # a power failure may have left it, or it is an unexpected symbolic link
-    with open(new_path, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+    with open(new_path, "xb", opener=_open_private) as file:
         if os.geteuid() == 0:
             owner = path.parent.stat()
             os.fchown(file.fileno(), owner.st_uid, owner.st_gid)
@@ -83,6 +83,10 @@ def overwrite_private(path: Path, content: bytes) -> None:
         file.truncate()
         file.flush()
         os.fsync(file.fileno())
+
+
+def _open_private(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
 
 
 ROOT_USER = 0
@@ -181,7 +185,8 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
 
 def _socket_name(folder: Path, pack: str) -> str:
     """Return the name of the lock, a hash within the length limit of socket names."""
-    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{os.path.realpath(folder)}/{pack}')).hexdigest()[:32]}"
+    real_folder = os.path.realpath(folder)
+    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{real_folder}/{pack}')).hexdigest()[:32]}"
 
 
 def _find_holder(name: str) -> tuple[int, int]:

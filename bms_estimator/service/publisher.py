@@ -123,8 +123,9 @@ class Publisher:
 
     def set_rate(self, rate_hz: float) -> None:
         """Set the publish rate from the next publication on [1/s]."""
-        publish, self.period_s = self._settings.publish.model_copy(update={"rate_hz": rate_hz}), 1.0 / rate_hz
+        publish = self._settings.publish.model_copy(update={"rate_hz": rate_hz})
         self._settings = self._settings.model_copy(update={"publish": publish})
+        self.period_s = 1.0 / rate_hz
         self._fresh_s = FRESH_PERIODS * max(self.period_s, self._settings.sensor.sample_period_s)
 
     @property
@@ -232,9 +233,10 @@ class Publisher:
 
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_sent_s = self._started_s
+        parameters = make_parameters_payload(self._estimator, self._started_wall_s)
         return Snapshot(
             None,
-            make_parameters_payload(self._estimator, self._started_wall_s),
+            parameters,
             self._make_health(now_s, self._sensor_message(now_s)),
             self._make_info(),
             self.alarm_monitor.report,
@@ -333,12 +335,9 @@ class Publisher:
 
     def _make_info(self) -> Info:
         self._board = self._source.board or self._board  # properties of an unplugged board remain
+        sensed = bool(self._estimator.record["filter"]["sensed"][0])
         return make_info_payload(
-            self._settings,
-            self._cell,
-            self._board,
-            self._started_wall_s,
-            temperature_sensor=bool(self._estimator.record["filter"]["sensed"][0]),
+            self._settings, self._cell, self._board, self._started_wall_s, temperature_sensor=sensed
         )
 
     def _sensor_message(self, now_s: float) -> str | None:
@@ -356,8 +355,5 @@ class Publisher:
 
     def _dropped_counts(self) -> dict[str, int]:
         """Return the dropped samples by kind."""
-        return {
-            name.removeprefix("dropped_"): n
-            for name, n in sample_counters(self._estimator.state[0]).items()
-            if name.startswith("dropped_")
-        }
+        counted = sample_counters(self._estimator.state[0]).items()
+        return {name.removeprefix("dropped_"): n for name, n in counted if name.startswith("dropped_")}

@@ -131,17 +131,9 @@ def monitored_alarms(settings: Settings, cell: PackModel) -> tuple[AlarmDefiniti
         UserError: A clear level lies beyond its limit.
     """
     defaults = _defaults(settings, cell)
-    return (
-        *filter(
-            None,
-            (
-                _definition(name, getattr(settings.alarms, name), defaults[name])
-                for name in ALARMS
-                if name != STATE_LOST.name
-            ),
-        ),
-        STATE_LOST,
-    )
+    configured = (name for name in ALARMS if name != STATE_LOST.name)
+    definitions = (_definition(name, getattr(settings.alarms, name), defaults[name]) for name in configured)
+    return (*(each for each in definitions if each is not None), STATE_LOST)
 
 
 def short_limit_a(settings: Settings, cell: PackModel) -> float:

@@ -48,11 +48,8 @@ class FaultLog:
         faults = sum(1 if name in _LOGGED_ONCE else n for name, n in nonzero.items())
         if faults != self._logged_faults and now_s - self._log_time_s >= MIN_LOG_INTERVAL_S:
             self._logged_faults, self._log_time_s = faults, now_s
-            log.warning(
-                "faults on the line",
-                **{_LOGGED_ONCE.get(name, name): n for name, n in nonzero.items()},
-                **({"first": first_invalid} if first_invalid else {}),
-            )
+            named = {_LOGGED_ONCE.get(name, name): n for name, n in nonzero.items()}
+            log.warning("faults on the line", **named, **({"first": first_invalid} if first_invalid else {}))
 
 
 class SilenceLog:

@@ -325,10 +325,8 @@ class LineSource:
             self._lines.put_nowait((self._wall_offset_s + self._monotonic(), line))
             return
         self._connections += 1
-        self._connected, self._last_sample_s = (
-            True,
-            self._monotonic() + (RECONNECT_GRACE_S if self._connections > 1 else 0.0),
-        )
+        grace_s = RECONNECT_GRACE_S if self._connections > 1 else 0.0
+        self._connected, self._last_sample_s = True, self._monotonic() + grace_s
         self._silence_reason = NO_SAMPLE_YET
         log.info("connected", source=self._producer.name)
 

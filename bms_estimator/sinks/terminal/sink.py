@@ -51,13 +51,12 @@ def build_screen(view: ViewState, width: int) -> RenderableType:
     """Return the screen for a terminal of ``width`` cells."""
     messages = [] if view.pack is None else _messages(view.pack)
     messages.sort(key=lambda message: message.style != URGENT_STYLE)
-    lines: list[RenderableType] = [
-        ("nothing has been published yet" if view.pack is None else _pack_table(view, view.pack, width)),
-        *messages[:MAX_MESSAGES],
-    ]
+    table = "nothing has been published yet" if view.pack is None else _pack_table(view, view.pack, width)
+    lines: list[RenderableType] = [table, *messages[:MAX_MESSAGES]]
     if len(messages) > MAX_MESSAGES:
         lines.append(Text(f"alarms and faults not shown: {len(messages) - MAX_MESSAGES}", style=URGENT_STYLE))
-    return Group(*lines, *map(Text.from_ansi, view.log[-LOG_LINES:]), Text(view.hint, style="cyan"))
+    log_lines = map(Text.from_ansi, view.log[-LOG_LINES:])
+    return Group(*lines, *log_lines, Text(view.hint, style="cyan"))
 
 
 def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:

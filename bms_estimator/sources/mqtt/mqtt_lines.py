@@ -99,7 +99,8 @@ class MqttProducer(LineProducer):
         try:
             async with self._connect(self._broker, self._options) as connection:
                 # without retain-as-published, live messages arrive unmarked even if their publisher retains them
-                for topic, reason in (await connection.subscribe(requests=None, others=self._assembler.topics)).items():
+                rejections = await connection.subscribe(requests=None, others=self._assembler.topics)
+                for topic, reason in rejections.items():
                     raise SourceUnavailableError(f"not allowed to read {topic}: {reason}")
                 yield CONNECTED
                 async for line in self._lines(connection):
@@ -137,17 +138,8 @@ class MqttProducer(LineProducer):
 
     def _wait_s(self, now_s: float, poll_sent_s: float) -> float | None:
         """Return the time to wait for a message [s]; None without limit."""
-        return min(
-            (
-                s
-                for s in (
-                    (max(poll_sent_s + self._settings.ask_s - now_s, 0.0) if self._settings.ask else None),
-                    self._assembler.wait_s(now_s),
-                )
-                if s is not None
-            ),
-            default=None,
-        )
+        poll_due_s = max(poll_sent_s + self._settings.ask_s - now_s, 0.0) if self._settings.ask else None
+        return min((s for s in (poll_due_s, self._assembler.wait_s(now_s)) if s is not None), default=None)
 
     async def _poll(self, connection: Connection) -> None:
         """Publish the messages that make the publisher report its values."""

@@ -128,15 +128,10 @@ class SampleAssembler:
 
         A filter that another one covers is omitted, because some brokers would deliver its messages twice.
         """
-        filters = list(
-            dict.fromkeys(
-                _topic_filter(topic)
-                for topic in (
-                    [binding.topic for binding in self._bindings]
-                    + ([self._availability_topic] if self._availability_topic else [])
-                )
-            )
+        topics = [binding.topic for binding in self._bindings] + (
+            [self._availability_topic] if self._availability_topic else []
         )
+        filters = list(dict.fromkeys(_topic_filter(topic) for topic in topics))
         return [topic for topic in filters if not any(_covers(other, topic) for other in filters if other != topic)]
 
     @property
@@ -269,9 +264,8 @@ class SampleAssembler:
                 key = (*location, number)
                 messages = self._values[key].messages + 1 if key in self._values else 1
                 permanent = self._is_online and binding.quantity not in EXPIRING_QUANTITIES
-                self._values[key] = _StoredValue(
-                    value, now_s, math.inf if permanent else now_s + self._max_age_s[binding.quantity], messages
-                )
+                expiry_s = math.inf if permanent else now_s + self._max_age_s[binding.quantity]
+                self._values[key] = _StoredValue(value, now_s, expiry_s, messages)
         if binding.quantity in REQUIRED_QUANTITIES:
             self._unused_arrival_s.setdefault(binding.quantity, now_s)
 
@@ -289,12 +283,8 @@ class SampleAssembler:
             stored = self._values.get(key)
             if stored and location[0] not in REQUIRED_QUANTITIES:
                 is_regular = is_loss or stored.messages >= REGULAR_MESSAGES
-                self._values[key] = stored._replace(
-                    expiry_s=min(
-                        stored.expiry_s, stored.arrival_s + (self._settings.absent_s if is_regular else math.inf)
-                    ),
-                    messages=0,
-                )
+                limit_s = stored.arrival_s + (self._settings.absent_s if is_regular else math.inf)
+                self._values[key] = stored._replace(expiry_s=min(stored.expiry_s, limit_s), messages=0)
         self._irregular.add(location)
 
     def _update_conflict(self, binding: _TopicBinding, now_s: float) -> bool:
@@ -315,9 +305,8 @@ class SampleAssembler:
         """Count a sample that lacks voltage or current."""
         self._counters["stale"] += 1
         if (name, 0, 1) in self._values:
-            self.faults.setdefault(
-                name, f"{name}: no message on {self._name_topics(name)} for {self._settings.stale_s:g} s{self._hint}"
-            )
+            topics = self._name_topics(name)
+            self.faults.setdefault(name, f"{name}: no message on {topics} for {self._settings.stale_s:g} s{self._hint}")
 
     def _value(self, name: str, now_s: float) -> float | None:
         """Return a value unless it is too old."""
@@ -334,15 +323,10 @@ class SampleAssembler:
     def _probes_c(self, now_s: float) -> list[float]:
         """Return the recent temperatures of all probes in the order of the locations [C]; NaN for a probe without one."""
         probes = sorted(key for key in self._values if key[0] == "temperature")
-        # the dictionary has the highest number of a probe by index of the location
-        keys = [
-            ("temperature", index, i + 1)
-            for index, count in {index: number for _, index, number in probes}.items()
-            for i in range(count)
-        ]
-        return [
-            slot.value if slot and self._is_fresh(slot, now_s) else math.nan for slot in map(self._values.get, keys)
-        ]
+        counts = {index: number for _, index, number in probes}  # highest number of a probe by index of the location
+        keys = [("temperature", index, i + 1) for index, count in counts.items() for i in range(count)]
+        slots = [self._values.get(key) for key in keys]
+        return [slot.value if slot and self._is_fresh(slot, now_s) else math.nan for slot in slots]
 
     def _name_topics(self, *quantities: str) -> str:
         """Return the first topic of each quantity, and the number of the others."""
@@ -363,7 +347,8 @@ def _read_values(binding: _TopicBinding, payload: bytes, number: int | None) -> 
     Raises:
         InvalidValueError: The payload has no valid value.
     """
-    if number is None and (binding.quantity == "cells" or CELL_PLACEHOLDER.search(binding.path)):
+    has_numbers = binding.quantity == "cells" or CELL_PLACEHOLDER.search(binding.path)
+    if number is None and has_numbers:
         return read_cells(payload, binding.location, binding.path)
     return {1 if number is None else number: read_value(payload, binding.location, binding.path)}
 

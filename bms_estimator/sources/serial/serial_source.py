@@ -82,10 +82,9 @@ class SerialSource:
         self._monotonic = monotonic
         make_protocol(settings).feed(0.0, b"\0\n")  # ends a frame, so that numba compiles the decoder now
         self._decoder = make_protocol(settings)
+        has_serial_number = settings.protocol == "binary"  # other devices report no serial number
         self.board_check = BoardCheck(
-            lambda: make_protocol(settings),
-            settings.serial or "",
-            board_file if settings.protocol == "binary" else None,  # other devices report no serial number
+            lambda: make_protocol(settings), settings.serial or "", board_file if has_serial_number else None
         )
         """Check that the board is the pack's."""
         self._discovery = PortDiscovery(settings.port, monotonic)
