@@ -290,7 +290,8 @@ def _try_convert(name: str, convert: Callable[[], T], outcomes: dict[str, str]) 
 
 def _refusal(error: Exception) -> str:
     """Return the outcome of a part whose arrays are damaged."""
-    return f"{REFUSED}{'' if isinstance(error, ValueError) else f'{type(error).__name__}: '}{error}"
+    kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+    return f"{REFUSED}{kind}{error}"
 
 
 def new_pack(
@@ -346,11 +347,12 @@ def assemble(
     if has_load and estimator.has_filter:
         cell = estimator.cell.battery("the identifier is of batteries")
         forecaster = Forecaster(estimator, cutoff_v=forecast_end_v(settings, cell), limits=power_limits(settings, cell))
+    device_soc_std = settings.pack.device_soc_std if estimator.has_filter else None
     return Pack(
         estimator,
         slow_fit,
         CellEstimator(estimator),
         forecaster,
         has_forecasts=has_forecasts,
-        device_soc_std=settings.pack.device_soc_std if estimator.has_filter else None,
+        device_soc_std=device_soc_std,
     )

@@ -224,7 +224,8 @@ class Publisher:
         """Short text about the pack for systemd."""
         if self.snapshot.health.sensor_message:
             return f"no samples: {self.snapshot.health.sensor_message}"
-        return f"SOC {self.latest.soc:.2f}" if self.latest and self.latest.soc is not None else ""
+        soc = self.latest.soc if self.latest else None
+        return "" if soc is None else f"SOC {soc:.2f}"
 
     @property
     def not_at_rest_reason(self) -> str | None:
@@ -271,15 +272,18 @@ class Publisher:
         self._charge_energy = self._charge_energy.at_least(
             self._status.saved_charge_energy or self._totals.charge_energy
         )
-        forecaster, no_forecast = self._pack.forecaster, self._no_forecast
+        capacity_ah = self._cell.capacity_ah
+        forecast, forecaster = self._no_forecast, self._pack.forecaster
+        if forecaster:
+            forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)
         return make_state_payload(
             window,
             remaining_capacity_ah(self._estimator),
-            forecaster.latest_at(window.voltage_v, window.current_a, window.power_w) if forecaster else no_forecast,
+            forecast,
             self._source.counters,
             wall_s,
             self._charge_energy,
-            self._cell.capacity_ah,
+            capacity_ah,
             single_cell_fields(self._pack),
             self._device_soc,
         )
@@ -322,7 +326,8 @@ class Publisher:
             log.warning("suspected input faults", suspects=health.suspects or "none")
 
     def _loop_health(self) -> LoopHealth:
-        status, (p50_s, p99_s, max_s) = self._status, self._latency.pop_summary() or (None, None, None)
+        p50_s, p99_s, max_s = self._latency.pop_summary() or (None, None, None)
+        status = self._status
         return LoopHealth(
             latency_p50_s=p50_s,
             latency_p99_s=p99_s,
@@ -350,8 +355,9 @@ class Publisher:
         if math.isinf(silent_s):
             silent_s = now_s - self._started_s
         dropped = {kind: n - self._dropped_before[kind] for kind, n in self._dropped_counts().items()}
-        since = f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
-        return f"no usable sample for {silent_s:.1f} s{since}{f'; {self._drop_reason}' if self._drop_reason else ''}"
+        text = f"no usable sample for {silent_s:.1f} s"
+        text += f"; dropped since: {dropped_text(dropped)}" if any(dropped.values()) else ""
+        return f"{text}; {self._drop_reason}" if self._drop_reason else text
 
     def _dropped_counts(self) -> dict[str, int]:
         """Return the dropped samples by kind."""

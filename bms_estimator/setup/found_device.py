@@ -58,8 +58,10 @@ class FoundDevice:
 
 def with_pairs(devices: Sequence[FoundDevice]) -> list[FoundDevice]:
     """Return the devices, and each pair of a battery monitor, such as a shunt, and a BMS that may belong to one pack."""
-    pairs = ((a, b) for a in devices for b in devices if b.has_cells and not a.has_cells)
-    return [*devices, *(_pair(a, b) for a, b in pairs if _may_be_of_one_pack(a, b))]
+    pairs = [
+        _pair(a, b) for a in devices for b in devices if b.has_cells and not a.has_cells and _may_be_of_one_pack(a, b)
+    ]
+    return [*devices, *pairs]
 
 
 def _may_be_of_one_pack(monitor: FoundDevice, bms: FoundDevice) -> bool:

@@ -131,7 +131,8 @@ def _validated(model: type[BaseModel], key: str, value: object) -> object:
     try:
         return getattr(model.model_validate({key: value}), key)
     except ValidationError as error:
-        detail, description = error.errors()[0], model.model_fields[key].description
+        detail = error.errors()[0]
+        description = model.model_fields[key].description
         raise InvalidAnswerError(f"{without_secrets(str(value))}: {error_reason(detail)} ({description})") from None
 
 
@@ -152,7 +153,8 @@ def _parse_capacity(text: str, _: Answers) -> object:
 
 
 def _parse_series(text: str, answers: Answers) -> object:
-    series, reported = _validated(PackSettings, "series", _integer(text)), answers.device.cells
+    series = _validated(PackSettings, "series", _integer(text))
+    reported = answers.device.cells
     if reported is not None and series != reported:
         raise InvalidAnswerError(f"{text}: the device reports {reported} cells in series")
     if answers.voltage_v is None or answers.cell is None or not isinstance(series, int):

@@ -198,8 +198,9 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
         if "host" in address:  # a serial port is reported already
             result.failures.append(f"{name}: Modbus was not searched: {command}; {BROKER_HINT}")
         return
-    is_serial, reasons = "port" in address, list[str]()
+    is_serial = "port" in address
     profiles = [name for name, table in MODBUS_PROFILES.items() if not is_serial or "baud" in table]
+    reasons = list[str]()
     for profile in profiles:
         source = {"kind": "modbus", "profile": profile, **address}
         device = FoundDevice(
@@ -216,8 +217,9 @@ async def _search_modbus(address: dict[str, object], name: str, result: SearchRe
                 )
             )
     if not is_serial:
-        none_found = [f"{name}: no Modbus device; {BROKER_HINT}"] * (len(reasons) == len(profiles))
-        result.failures += [*reasons, *none_found]
+        result.failures += reasons
+        if len(reasons) == len(profiles):
+            result.failures.append(f"{name}: no Modbus device; {BROKER_HINT}")
 
 
 async def _search_bluetooth(result: SearchResult) -> None:

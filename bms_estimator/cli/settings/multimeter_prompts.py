@@ -81,19 +81,13 @@ def _compare_options(comparison: Comparison, options: MultimeterOptions) -> None
 
 def _compare_interactively(comparison: Comparison) -> None:
     typer.echo("Press Enter without a value to skip a step.")
-    if _ask_and_compare(
-        "Voltage at the terminals of the pack by the multimeter [V]",
-        lambda text: comparison.compare_voltage(parse_number(text, "V")),
-    ):
-        _ask_and_compare(
-            "Voltage again at another state of charge, after you charged or discharged the pack [V]",
-            lambda text: comparison.compare_voltage(parse_number(text, "V")),
-        )
+    first_v = "Voltage at the terminals of the pack by the multimeter [V]"
+    if _ask_and_compare(first_v, lambda text: comparison.compare_voltage(parse_number(text, "V"))):
+        second_v = "Voltage again at another state of charge, after you charged or discharged the pack [V]"
+        _ask_and_compare(second_v, lambda text: comparison.compare_voltage(parse_number(text, "V")))
     _ask_and_compare("Switch off all loads and chargers; then enter 0", partial(_set_zero, comparison))
-    if not _ask_and_compare(
-        "Switch on a load; its current by the multimeter [A], negative while the pack is charged",
-        lambda text: comparison.compare_current(parse_number(text, "A")),
-    ):
+    load = "Switch on a load; its current by the multimeter [A], negative while the pack is charged"
+    if not _ask_and_compare(load, lambda text: comparison.compare_current(parse_number(text, "A"))):
         _ask_and_compare(
             "The pack is now discharging or charging", lambda text: comparison.compare_direction(text.lower())
         )

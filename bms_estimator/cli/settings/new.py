@@ -206,7 +206,8 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
         raise UserError("--search: no device was found; give its place: --search PLACE")
     may_search = prompts.is_interactive and device is None
     while True:
-        parse, default = partial(_parse_device, result=result, may_search=may_search), "1" * (len(result.choices) == 1)
+        parse = partial(_parse_device, result=result, may_search=may_search)
+        default = "1" if len(result.choices) == 1 else ""
         text = f"Number of the device, or another place to search ({_place_kinds()})"
         chosen = prompts.ask(text, "--device", device, parse, default=default)
         if isinstance(chosen, FoundDevice):
@@ -232,9 +233,8 @@ def _log_in(prompts: Prompts, result: SearchResult) -> SearchResult:
         if not username:
             result = replace(result, login_required=others)
             continue
-        new_result = _search(
-            [BrokerLogin(login.url, username, str(typer.prompt("Password", hide_input=True))).address], result.devices
-        )
+        password = str(typer.prompt("Password", hide_input=True))
+        new_result = _search([BrokerLogin(login.url, username, password).address], result.devices)
         result = replace(
             new_result,
             broker=new_result.broker or result.broker,

@@ -139,8 +139,8 @@ def _done(session: SetupSession, _: str) -> str:
         return ""
     warnings = f"<ul class='bad'>{_items(session.pack.warnings)}</ul>" if session.pack.warnings else ""
     install, run = escape(shlex.join(root_command("install", session.file))), escape(run_command(session.file))
-    cell, measured = session.pack.cell.cell, session.measured
-    note = current_note(measured.current_a, cell.capacity_ah) if measured else ""
+    capacity_ah = session.pack.cell.cell.capacity_ah
+    note = current_note(session.measured.current_a, capacity_ah) if session.measured else ""
     return (
         '<section class="card"><h2>State of charge</h2><div id="known"><p class="huge"><b data-q="soc">&nbsp;</b>'
         '<small>%</small></p><p class="band">± <b data-q="band">&nbsp;</b> %</p><p class="note">two standard deviations</p></div>'
