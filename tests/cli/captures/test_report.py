@@ -21,7 +21,7 @@ from bms_estimator.pack_model.history import History
 from bms_estimator.pack_model.saved import history_arrays
 from bms_estimator.sources.captures.replay import load_capture
 from tests.calibration.simulated_load import TRUTH, capture, steps
-from tests.command_line import run
+from tests.command_line import error, run
 from tests.pack_model.histories import Truth, cell_curves, measured_rows, with_voltages
 from tests.store.test_history import record_history, snapshot_at
 
@@ -217,8 +217,7 @@ def test_user_errors_end_with_code_2(tmp_path, capsys, steps_csv):
         assert message in " ".join(err.split())
         assert not out.exists()
     out.write_text("mine")
-    code, _, err = run(capsys, "report", steps_csv, "--cell", "ncr18650", "--out", out)
-    assert code == 2
+    err = error(run(capsys, "report", steps_csv, "--cell", "ncr18650", "--out", out))
     assert "exists already; --force replaces it" in err
     assert out.read_text() == "mine"
 
@@ -237,8 +236,7 @@ def test_residuals_are_measured_less_modeled_voltage(tmp_path, capsys, steps_csv
         for row in rows[::500]:
             assert float(row["voltage_v"]) - float(row["modeled_v"]) == pytest.approx(float(row["error_v"]), abs=1e-12)
         assert float(rows[0]["soc"]) == pytest.approx(0.98, abs=2e-3)
-    code, _, err = run(capsys, "validate", steps_csv, "--cell", "ncr18650", "--out", tmp_path / name)
-    assert code == 2
+    err = error(run(capsys, "validate", steps_csv, "--cell", "ncr18650", "--out", tmp_path / name))
     assert "exists already" in err
 
 
@@ -265,6 +263,5 @@ def test_a_wrong_number_of_cells_is_an_error_of_the_report(tmp_path, capsys):
     rows = capture(steps())
     rows["voltage_v"] *= 2.0
     path, page = write_table(tmp_path / "two.csv", rows), tmp_path / "page.html"
-    code, _, err = run(capsys, "report", path, "--cell", "ncr18650", "--out", page)
-    assert code == 2
+    err = error(run(capsys, "report", path, "--cell", "ncr18650", "--out", page))
     assert "check the cell file and the number of cells in series (option --series of" in err

@@ -11,7 +11,7 @@ from bms_estimator.checkpoint.state_files import StateFiles
 from bms_estimator.cli.options.pack_options import load_pack
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.pack_model.saved import history_arrays
-from tests.command_line import run
+from tests.command_line import error, run
 from tests.estimator.anywhere.use import days
 from tests.estimator.simulated_cell import TRUTH, measured
 
@@ -72,8 +72,7 @@ def test_a_use_can_be_given_for_a_pack_without_a_history(capsys: pytest.CaptureF
     history = StateFiles(pack.parent, *load_pack(pack)).history.path
     history.rename(history.with_suffix(".moved"))
     try:
-        code, _, err = run(capsys, "accuracy", "--pack", pack)
-        assert code == 2
+        err = error(run(capsys, "accuracy", "--pack", pack))
         assert (
             "the history has a use from 37% to 37% only; give --between LOW HIGH" in err
         )  # the rows of the checkpoint
@@ -93,6 +92,5 @@ def test_a_use_can_be_given_for_a_pack_without_a_history(capsys: pytest.CaptureF
 def test_an_unusable_use_is_rejected(
     capsys: pytest.CaptureFixture[str], arguments: tuple[object, ...], message: str
 ) -> None:
-    code, _, err = run(capsys, "accuracy", *arguments)
-    assert code == 2
+    err = error(run(capsys, "accuracy", *arguments))
     assert message in err

@@ -22,7 +22,7 @@ from bms_estimator.simulation.simulated_pack import PackWithRelay
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.captures.raw_capture import CaptureWriter, read_capture, read_header
 from bms_estimator.sources.captures.replay import load_capture
-from tests.command_line import PROGRAM, run, running_program
+from tests.command_line import PROGRAM, error, run, running_program
 from tests.patience import LONG_S
 
 LOAD_A = 3.0
@@ -253,8 +253,7 @@ def test_an_interrupted_test_is_not_replaced_by_another(capsys, tmp_path) -> Non
     pack, out = tmp_path / "pack.toml", tmp_path / "cell.toml"
     pack.write_text(PACK.format(port="/dev/null"))
     (tmp_path / "cell.calibration.json").write_text('{"test": "long", "recordings": []}')
-    code, _, err = run(capsys, "calibrate", pack, "--out", out)
-    assert code == 2
+    err = error(run(capsys, "calibrate", pack, "--out", out))
     assert "--test long" in err
     assert "--restart" in err
 
@@ -263,8 +262,7 @@ def test_an_interrupted_test_of_another_pack_is_not_continued(capsys, tmp_path) 
     state = '{"test": "short", "pack": "shed, 3 Ah, 1s1p", "recordings": ["cell-1.bms"]}'
     (tmp_path / "pack.toml").write_text(PACK.format(port="/dev/absent"))
     (tmp_path / "cell.calibration.json").write_text(state)
-    code, _, err = run(capsys, "calibrate", tmp_path / "pack.toml", "--out", tmp_path / "cell.toml")
-    assert code == 2
+    err = error(run(capsys, "calibrate", tmp_path / "pack.toml", "--out", tmp_path / "cell.toml"))
     assert "(shed, 3 Ah, 1s1p; now mine, 3 Ah, 1s1p); give another --out" in err
     assert (tmp_path / "cell.calibration.json").read_text() == state
 

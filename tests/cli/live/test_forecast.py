@@ -16,7 +16,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.pack.pack import new_pack
 from bms_estimator.pack.state import CHECKPOINT, LOAD
 from bms_estimator.simulation.simulated_pack import SimulatedPack, random_steps
-from tests.command_line import run
+from tests.command_line import error, run
 
 CELL = "ncr18650"
 
@@ -175,8 +175,7 @@ def test_invalid_arguments_are_reported(
 def test_missing_checkpoint_is_reported(capsys: pytest.CaptureFixture[str], pack: Path, tmp_path: Path) -> None:
     other = tmp_path / "pack.toml"  # names the state folder of ``pack``, which contains no checkpoint of this cell
     other.write_text(pack.read_text().replace("ncr18650", "chen_mora"))
-    code, _, err = run(capsys, "forecast", other, "--power-w", 5)
-    assert code == 2
+    err = error(run(capsys, "forecast", other, "--power-w", 5))
     assert "no checkpoint to read: none found; the pack's service saves a checkpoint every" in err
 
 
@@ -187,8 +186,7 @@ def test_checkpoint_of_another_pack_is_reported(capsys: pytest.CaptureFixture[st
     settings, cell = load_pack(other)
     [checkpoint] = [path for path in (pack.parent / "state").iterdir() if not path.name.endswith(LOAD_SUFFIX)]
     CheckpointFile(tmp_path / "state", settings, cell).path.write_bytes(checkpoint.read_bytes())
-    code, _, err = run(capsys, "forecast", other, "--power-w", 5)
-    assert code == 2
+    err = error(run(capsys, "forecast", other, "--power-w", 5))
     assert "it belongs to another pack or cell" in err
 
 

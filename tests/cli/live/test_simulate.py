@@ -18,7 +18,7 @@ from bms_estimator.model.pack_model import load_fuel_cell
 from bms_estimator.protocols.base.relay import Relay
 from bms_estimator.protocols.firmware.frame_decoder import FrameDecoder
 from bms_estimator.protocols.firmware.messages import set_rate_command, set_relay_command
-from tests.command_line import PROGRAM, run
+from tests.command_line import PROGRAM, error, run
 from tests.patience import LONG_S
 
 RATE_HZ = 50
@@ -105,8 +105,7 @@ def test_a_board_measures_a_fuel_cell_under_a_constant_load():
 
 @pytest.mark.parametrize("option", [("--capacity-ah", "3"), ("--protocol", "jk"), ("--load", "relay")])
 def test_options_of_batteries_are_rejected_for_a_fuel_cell(option, capsys):
-    code, _, err = run(capsys, "simulate", "--cell", "pem_30w", *option)
-    assert code == 2
+    err = error(run(capsys, "simulate", "--cell", "pem_30w", *option))
     assert "--cell pem_30w: a fuel cell is simulated on a board without relay; omit --capacity-ah" in err
 
 

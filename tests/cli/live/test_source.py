@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.settings.pack import load_settings
 from bms_estimator.sources.captures.replay import RawCapture
-from tests.command_line import run
+from tests.command_line import error, run
 from tests.sources.linux.sysfs_folder import hwmon
 
 
@@ -39,8 +39,7 @@ def test_chip_of_this_machine_is_recorded_and_replayed(pack, tmp_path, capsys):
 
 @pytest.mark.parametrize(("command", "options"), [("run", ("--no-view",)), ("record", ("x.raw", "--pack"))])
 def test_port_option_is_rejected_without_a_serial_source(command, options, pack, capsys):
-    code, _, err = run(capsys, command, *options, write_linux_settings(pack), "--port", "/dev/ttyACM0")
-    assert code == 2
+    err = error(run(capsys, command, *options, write_linux_settings(pack), "--port", "/dev/ttyACM0"))
     assert "port: applies to a serial device, but [source] in the settings is another device" in err
 
 

@@ -2,21 +2,19 @@
 
 import pytest
 
-from tests.command_line import run
+from tests.command_line import error, run
 
 
 @pytest.mark.parametrize("text", ["3_9", "٣", "nan", "inf", "-inf", "0x3", "3,9", "", "1e999"])
 def test_text_that_is_no_decimal_number_is_rejected(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = run(capsys, "board", "/dev/null", f"--divider={text}")
-    assert code == 2
+    err = error(run(capsys, "board", "/dev/null", f"--divider={text}"))
     assert "--divider" in err
     assert "no decimal number" in err
 
 
 @pytest.mark.parametrize("text", ["0.5", "200"])
 def test_number_outside_its_limits_is_rejected(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = run(capsys, "board", "/dev/null", "--divider", text)
-    assert code == 2
+    err = error(run(capsys, "board", "/dev/null", "--divider", text))
     assert f"{text}: must be at least 1 and at most 100" in " ".join(err.replace("│", "").split())
 
 
@@ -33,8 +31,7 @@ def test_number_outside_its_limits_is_rejected(text: str, capsys: pytest.Capture
 def test_every_option_for_a_number_rejects_the_digit_separator_of_python(
     option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, _, err = run(capsys, *f"{option}=0_1".split())
-    assert code == 2
+    err = error(run(capsys, *f"{option}=0_1".split()))
     assert "no decimal number" in err
 
 
@@ -55,13 +52,11 @@ def test_every_option_for_a_number_rejects_the_digit_separator_of_python(
 )
 @pytest.mark.parametrize("text", ["1_200", "٣", "0x3", "3.0", "1e3", ""])
 def test_text_that_is_no_integer_is_rejected(option: str, text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = run(capsys, *f"{option}={text}".split(" "))
-    assert code == 2
+    err = error(run(capsys, *f"{option}={text}".split(" ")))
     assert "not an integer" in err
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "65536"])
 def test_integer_outside_its_limits_is_rejected(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    code, _, err = run(capsys, "demo", f"--port={text}")
-    assert code == 2
+    err = error(run(capsys, "demo", f"--port={text}"))
     assert f"{text}: must be at least 1 and at most 65535" in " ".join(err.replace("│", "").split())

@@ -20,7 +20,7 @@ from bms_estimator.fleet.nats.streams import make_streams
 from bms_estimator.fleet.server.backup import BACKUP_ORDER, back_up, restore
 from bms_estimator.fleet.worker.checkpoint.claims import Claims
 from bms_estimator.process.runtime import end_tasks
-from tests.command_line import run
+from tests.command_line import error, run
 from tests.fleet.nats_cluster import NatsCluster, connected, running
 from tests.fleet.partition_stream import estimates_of
 from tests.fleet.workers import Heartbeats, Process, block, end_states, load_packs, record_of_run, samples, send, until
@@ -232,8 +232,7 @@ def test_invalid_backup_is_refused_and_the_server_is_unchanged(
     change, reason: str, backup: Path, servers: tuple[NatsCluster, NatsCluster], capsys: pytest.CaptureFixture[str]
 ) -> None:
     change(backup)
-    code, _, err = run(capsys, "fleet", "restore", backup, "--server", servers[1].url)
-    assert code == 2
+    err = error(run(capsys, "fleet", "restore", backup, "--server", servers[1].url))
     assert reason in err
     assert asyncio.run(last_sequences(servers[1].url)) == dict.fromkeys(BACKUP_ORDER, 0)
 
@@ -241,8 +240,7 @@ def test_invalid_backup_is_refused_and_the_server_is_unchanged(
 def test_server_with_data_is_not_overwritten(
     backup: Path, servers: tuple[NatsCluster, NatsCluster], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    code, _, err = run(capsys, "fleet", "restore", backup, "--server", servers[0].url)
-    assert code == 2
+    err = error(run(capsys, "fleet", "restore", backup, "--server", servers[0].url))
     assert "the server already has data, in RAW: restore on a new server" in err
     assert asyncio.run(last_sequences(servers[0].url))["RAW"] == 2
 
@@ -251,8 +249,7 @@ def test_backup_into_a_folder_with_files_is_refused(
     backup: Path, servers: tuple[NatsCluster, NatsCluster], capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (backup / "backup.json").read_bytes()
-    code, _, err = run(capsys, "fleet", "backup", backup, "--server", servers[0].url)
-    assert code == 2
+    err = error(run(capsys, "fleet", "backup", backup, "--server", servers[0].url))
     assert "is not empty: choose a new folder for each backup" in err
     assert (backup / "backup.json").read_bytes() == before
 

@@ -28,7 +28,7 @@ from bms_estimator.sources.serial import board_check, port_list, serial_source
 from bms_estimator.sources.serial.port_list import NO_BOARD, KnownBoardFile
 from bms_estimator.sources.serial.serial_port import SILENT_PORT_RETRY_S
 from bms_estimator.sources.serial.serial_source import SerialSource
-from tests.command_line import run
+from tests.command_line import error, run
 from tests.patience import until
 from tests.serial_line import usb_port
 
@@ -381,8 +381,7 @@ def test_accept_is_rejected_if_the_settings_contain_the_serial_number(
 ) -> None:
     pack = tmp_path / "pack.toml"
     pack.write_text('[sensor]\nserial = "0000002a"\n')
-    code, _, err = run(capsys, "board", "--accept", pack)
-    assert code == 2
+    err = error(run(capsys, "board", "--accept", pack))
     assert "sensor.serial = 0000002a: the settings name the board; change sensor.serial instead of --accept" in err
 
 
@@ -393,13 +392,11 @@ def test_accept_uses_the_given_folder_and_requires_a_stored_board(
     pack = tmp_path / "pack.toml"
     pack.write_text('[pack]\nname = "house"\n')
     memory.save(BOARD_42)
-    code, _, err = run(capsys, "board", "--accept", pack)
-    assert code == 2
+    err = error(run(capsys, "board", "--accept", pack))
     assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is stored in this file" in err
     assert run(capsys, "board", "--folder", memory.path.parent, "--accept", pack)[0] == 0
     assert memory.load() == NO_BOARD
-    code, _, err = run(capsys, "board", "--folder", tmp_path)
-    assert code == 2
+    err = error(run(capsys, "board", "--folder", tmp_path))
     assert "requires --accept" in err
 
 
