@@ -75,12 +75,13 @@ def is_compiled() -> bool:
     return CACHE_FOLDER is None or any((folder / COMPLETE_FILE).exists() for folder in (SHIPPED_FOLDER, CACHE_FOLDER))
 
 
-def compile_kernels(report: Report = lambda _: None, *, in_background: bool = False) -> None:
+def compile_kernels(report: Report = lambda _: None, stop: threading.Event | None = None) -> None:
     """Compile all kernels that are not in the cache, in as many children as CPUs and memory allow.
 
     Args:
         report: Called with the progress, in the calling thread. An exception that it raises ends the compilation.
-        in_background: True: the children have the lowest priority, and write nothing to stderr.
+        stop: Event that ends a compilation in the background, whose children have the lowest priority, and write nothing to
+            stderr; None: the compilation is not in the background.
 
     Raises:
         TemporaryError: The children end early.
@@ -90,11 +91,13 @@ def compile_kernels(report: Report = lambda _: None, *, in_background: bool = Fa
     order = compile_order()
     pending, done = deque(order), list[Kernel]()
     count = max(1, min(len(os.sched_getaffinity(0)), available_bytes() // CHILD_BYTES))
-    compilers = [_Compiler(pending, done, in_background=in_background) for _ in range(count)]
+    compilers = [_Compiler(pending, done, in_background=stop is not None) for _ in range(count)]
     try:
         for compiler in compilers:
             compiler.start()
         while running := [compiler for compiler in compilers if compiler.is_alive()]:
+            if stop and stop.is_set():
+                return
             report(Progress(len(done), len(order), sum(each.cpu_s for each in done), sum(each.cpu_s for each in order)))
             extend_start(f"compiling kernels: {len(done)} of {len(order)}")
             running[0].join(REPORT_INTERVAL_S)
@@ -117,23 +120,20 @@ def background_compilation() -> Iterator[Callable[[Report], None]]:
         Function that waits for the end of the compilation, with the argument and the exception of ``compile_kernels``. A
         compilation that failed in the background is repeated.
     """
-    reports: list[Report] = [lambda _: None]
+    latest, stop = deque[Progress](maxlen=1), threading.Event()
     with ThreadPoolExecutor(1) as executor:
-        compiling = executor.submit(
-            compile_kernels,
-            lambda progress: reports[-1](progress),  # noqa: PLW0108 - the last one at the time of the call
-            in_background=True,
-        )
+        compiling = executor.submit(compile_kernels, latest.append, stop)
 
         def finish(report: Report) -> None:
-            reports.append(report)
-            wait([compiling])
+            while wait([compiling], REPORT_INTERVAL_S).not_done:
+                if latest:
+                    report(latest[0])
             compile_kernels(report)
 
         try:
             yield finish
         finally:
-            reports.clear()  # the IndexError at the next report ends the compilation
+            stop.set()
 
 
 class _Compiler(threading.Thread):
@@ -141,7 +141,7 @@ class _Compiler(threading.Thread):
 
     def __init__(self, pending: deque[Kernel], done: list[Kernel], *, in_background: bool) -> None:
         super().__init__(daemon=True)
-        self._pending, self._done, self._prefix = pending, done, ("nice", "-n19") if in_background else ()
+        self._pending, self._done, self._in_background = pending, done, in_background
         self._lock, self._stopped = threading.Lock(), False
         self._child: subprocess.Popen[str] | None = None
 
@@ -181,10 +181,17 @@ class _Compiler(threading.Thread):
             if self._stopped:
                 return None
             self._child = subprocess.Popen(  # noqa: S603 - this module
-                [*self._prefix, sys.executable, "-P", "-m", __name__, str(MAX_CHILD_BYTES)],
+                [
+                    *(["nice", "-n19"] if self._in_background else []),
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    __name__,
+                    str(MAX_CHILD_BYTES),
+                ],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL if self._prefix else None,
+                stderr=subprocess.DEVNULL if self._in_background else None,
                 text=True,
                 start_new_session=True,  # Ctrl-C in the terminal ends only this process, which ends its children
             )

@@ -93,6 +93,12 @@ def test_a_compilation_in_the_background_is_finished_with_its_progress(cache: Pa
     assert (is_compiled(), reports[-1].all_kernels) == (True, 2)
 
 
+def test_a_compilation_in_the_background_ends_with_its_context(cache: Path) -> None:
+    with background_compilation():
+        assert not is_compiled()
+    assert not is_compiled()
+
+
 def test_a_compilation_that_fails_in_the_background_is_repeated(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with background_compilation() as finish, pytest.raises(TemporaryError, match="the compiler ended 3 times"):
