@@ -39,9 +39,6 @@ from bms_estimator.settings.pack import Settings
 
 PRIOR_S = 600.0
 """Time from the first sample of a new pack within which the SOC that its device reports is used as a prior [s]."""
-MAX_HELD_ROWS = 3
-"""Maximum number of rows that a new pack holds its first estimate back until the prior has an effect. A device that sends each
-value in a message of its own reports its SOC within them."""
 T = TypeVar("T")
 
 
@@ -75,8 +72,8 @@ class Pack:
         device_soc_std: Std of the SOC that the device reports, which is the prior of a new pack; None: it is not used.
 
     Attributes:
-        held_rows: Number of further rows after which the first estimate is shown. The row with the device's SOC does not
-            contain the prior, because the prior is added after it.
+        awaits_prior: True until an estimate contains the SOC of the device as a prior, or this SOC is not used. The row of the
+            sample with this SOC does not contain it, because the prior is added after the row.
     """
 
     def __init__(
@@ -91,7 +88,7 @@ class Pack:
     ) -> None:
         self._device_soc_std = device_soc_std  # None also after the prior was used, or its time has passed
         self._first_s = math.nan  # time of the first sample, if the device's SOC is awaited
-        self.held_rows = MAX_HELD_ROWS if device_soc_std else 0
+        self.awaits_prior = device_soc_std is not None
         self.estimator, self.slow_fit, self.cells, self.forecaster = estimator, slow_fit, cells, forecaster
         self._has_forecasts = has_forecasts and forecaster is not None
         self._has_cells = False  # of the present block
@@ -159,10 +156,11 @@ class Pack:
                 self.cells.run(samples[start:end], cells_v[start:end], trace)
             if self.slow_fit:
                 self.slow_fit.advance()
-            self.held_rows = max(self.held_rows - written, 0)
+            if written and self._device_soc_std is None:
+                self.awaits_prior = False
             if prior is not None and end == stop and self._device_soc_std and self.estimator.state["started"][0]:
                 self.estimator.add_prior(float(device_soc[end - 1]), self._device_soc_std)
-                self._device_soc_std, self.held_rows = None, 1
+                self._device_soc_std = None
             start, rows = end, rows + written
         return rows
 
@@ -242,8 +240,9 @@ class Pack:
         before, declared = state.declared, DeclaredValues.of(self.model)
         if before is None or declared is None or before == declared:
             return state
-        p = self.estimator.cell_file_settings
-        converted = _try_convert(CHECKPOINT, lambda: with_capacity(state, before, declared, p), outcomes)
+        converted = _try_convert(
+            CHECKPOINT, lambda: with_capacity(state, before, declared, self.estimator.cell_file_settings), outcomes
+        )
         if converted is None:
             return PackState(load=state.load, reasons=outcomes)
         outcomes[CAPACITY] = (
@@ -258,7 +257,7 @@ class Pack:
         if reason := restore_state(self.estimator, state.record_fields, gap_s):
             outcomes[CHECKPOINT] = f"{REFUSED}{reason}"
             return False
-        soc, self._device_soc_std, self.held_rows = self.estimator.soc, None, 0
+        soc, self._device_soc_std = self.estimator.soc, None
         outcomes[CHECKPOINT] = "restored" if math.isnan(soc) else f"restored: SOC {soc:.4f}"
         if CAPACITY in outcomes:
             outcomes[CAPACITY] += (

@@ -56,6 +56,9 @@ CELLS_INTERVAL_S = 60.0
 """Minimum interval between two comparisons of the cells [s]."""
 DROP_LOG_INTERVAL_S = 300.0
 """Minimum interval between two log lines on samples out of range [s]. The first one is logged at once."""
+MAX_HOLD_S = 10.0
+"""Maximum time from the first sample for which the first estimate waits for the SOC of the device [s]. Most devices report
+all values within it, even one by one."""
 SOURCE_HUNG_S = 20.0
 """Time after which a source whose task has not run counts as hung [s]. A missing port is retried at least every 10 s."""
 
@@ -117,7 +120,7 @@ class Publisher:
         self._drop_logged_s = -math.inf
         self._drop_reason: str | None = None  # reason why the last sample was dropped; None: it was accepted
         self._dropped_before = self._dropped_counts()  # by kind, when the last sample was accepted
-        self._is_ending = False  # True: the next snapshot is the last one
+        self._hold_end_s = math.inf  # time until which the first estimate may be held back, monotonic clock
         self.latest: Estimate | None = None
         self.snapshot = self._first_snapshot()
 
@@ -156,6 +159,7 @@ class Publisher:
         if trace.size:
             self._window.add(trace, self._clock.wall(), received.cells_v, received.probes)
             self._last_sample_s = now_s
+            self._hold_end_s = min(self._hold_end_s, now_s + MAX_HOLD_S)
         self._device_soc = finite(received.device_soc[-1]) if received.device_soc.size else None
         if trace.size < received.samples.size:
             self._drop_reason = out_of_range_reason(received.samples, self._estimator.settings[0]) or ""
@@ -173,7 +177,7 @@ class Publisher:
         """Evaluate the alarms of the samples that were passed to ``add_estimates``."""
         now_s = self._clock.monotonic()
         alarm_changed = self.alarm_monitor.add(received, result, now_s, cells_fault)
-        if not self.latest and now_s >= self._due_s and not self._pack.held_rows:
+        if not self.latest and now_s >= self._due_s and not self._is_held(now_s):
             self.publish()
         elif alarm_changed:
             self._pass_to_sinks(self.snapshot._replace(estimate=None, alarms=self.alarm_monitor.report))
@@ -208,8 +212,7 @@ class Publisher:
 
     def publish_last(self) -> None:
         """Publish a last snapshot with all payloads recomputed, also with an estimate that was held back."""
-        self._is_ending = True
-        self._slow_sent_s = self._forecast_sent_s = self._cells_sent_s = -math.inf
+        self._hold_end_s = self._slow_sent_s = self._forecast_sent_s = self._cells_sent_s = -math.inf
         self.publish()
 
     @property
@@ -234,10 +237,9 @@ class Publisher:
 
     def _first_snapshot(self) -> Snapshot:
         now_s = self._slow_sent_s = self._started_s
-        parameters = make_parameters_payload(self._estimator, self._started_wall_s)
         return Snapshot(
             None,
-            parameters,
+            make_parameters_payload(self._estimator, self._started_wall_s),
             self._make_health(now_s, self._sensor_message(now_s)),
             self._make_info(),
             self.alarm_monitor.report,
@@ -246,8 +248,7 @@ class Publisher:
     def _next_snapshot(self, now_s: float) -> Snapshot:
         """Return a snapshot with the estimate of this window. Other payloads are recomputed only when they are due."""
         _, parameters, health, info, _, forecast, cells = self.snapshot
-        is_held = self._pack.held_rows and not (self.latest or self._is_ending)
-        summary, wall_s = None if is_held else self._window.take(), self._clock.wall()
+        summary, wall_s = None if self._is_held(now_s) else self._window.take(), self._clock.wall()
         estimate = self._make_estimate(summary, wall_s) if summary else None
         if summary and now_s - self._forecast_sent_s >= FORECAST_INTERVAL_S:
             self._forecast_sent_s, forecast = now_s, self._make_forecast(summary, wall_s)
@@ -263,6 +264,10 @@ class Publisher:
             self._cells_sent_s, cells = now_s, make_cells_payload(self._deviations, self._short_limit_a, wall_s)
         return Snapshot(estimate, parameters, health, info, self.alarm_monitor.report, forecast, cells)
 
+    def _is_held(self, now_s: float) -> bool:
+        """Return True if the first estimate still waits for the SOC of the device."""
+        return self._pack.awaits_prior and not self.latest and now_s < self._hold_end_s
+
     @property
     def _deviations(self) -> CellDeviations | None:
         return self._pack.cells.deviations if self._pack.cells else None
@@ -272,7 +277,6 @@ class Publisher:
         self._charge_energy = self._charge_energy.at_least(
             self._status.saved_charge_energy or self._totals.charge_energy
         )
-        capacity_ah = self._cell.capacity_ah
         forecast, forecaster = self._no_forecast, self._pack.forecaster
         if forecaster:
             forecast = forecaster.latest_at(window.voltage_v, window.current_a, window.power_w)
@@ -283,7 +287,7 @@ class Publisher:
             self._source.counters,
             wall_s,
             self._charge_energy,
-            capacity_ah,
+            self._cell.capacity_ah,
             single_cell_fields(self._pack),
             self._device_soc,
         )

@@ -71,20 +71,21 @@ def test_a_wrong_chemistry_is_suspected_by_the_soc_of_the_device(chemistry: str,
 
 
 @pytest.mark.parametrize(
-    ("device_soc", "published"),
+    ("interval_s", "device_soc", "published"),
     [
-        ((0.6, 0.6, 0.6, 0.6), [(1.0, True), (2.0, True), (3.0, True)]),
-        ((math.nan, 0.6, 0.6, 0.6), [(2.0, True), (3.0, True)]),
-        ((math.nan, math.nan, math.nan, math.nan), [(2.0, False), (3.0, False)]),
-        ((0.6,), [(0.0, False)]),
+        (1.0, (0.6, 0.6, 0.6, 0.6), [(1.0, True), (2.0, True), (3.0, True)]),
+        (1.0, (math.nan, 0.6, 0.6, 0.6), [(2.0, True), (3.0, True)]),
+        (4.0, (math.nan, math.nan, math.nan, math.nan, 0.6), [(12.0, False), (16.0, False)]),
+        (60.0, (math.nan, math.nan, 0.6, 0.6), [(60.0, False), (120.0, False), (180.0, True)]),
+        (1.0, (0.6,), [(0.0, False)]),
     ],
 )
 def test_the_first_estimate_waits_for_the_soc_of_the_device(
-    device_soc: tuple[float, ...], published: list[tuple[float, bool]]
+    interval_s: float, device_soc: tuple[float, ...], published: list[tuple[float, bool]]
 ) -> None:
-    """The wait is limited to three samples, and to the end of the run."""
+    """The wait is limited to ten seconds, and to the end of the run."""
     settings = Settings.model_validate({"pack": {"cell": "lfp", "capacity_ah": 100.0, "device_soc_std": 0.1}})
-    rows = ((float(time_s), 0.0, 3.3, soc) for time_s, soc in enumerate(device_soc))
+    rows = ((interval_s * number, 0.0, 3.3, soc) for number, soc in enumerate(device_soc))
     publisher, snapshots = publish(settings, new_pack(settings, load_cell("lfp", 100.0)), rows)
     publisher.publish_last()
     assert [(each.estimate.board_time_s, each.estimate.soc_known) for each in snapshots if each.estimate] == published
@@ -124,7 +125,8 @@ def test_no_published_available_power_is_below_the_present_power(current_a: floa
     """The load rises to 3 C, and the charge to 2 C, after a forecast that assumes less."""
     limits = {"charge_over_current": {"limit_a": 10.0}}
     settings = Settings.model_validate({"alarms": limits, "pack": {"initial_soc": 0.5}})
-    pack, currents_a = new_pack(settings, load_cell("nmc", 3.0)), [0.0] * 36 + [current_a] * 4
+    pack = new_pack(settings, load_cell("nmc", 3.0))
+    currents_a = [0.0] * 36 + [current_a] * 4
     rows = ((float(time_s), each_a, 3.7 - 0.03 * each_a) for time_s, each_a in enumerate(currents_a))
     estimate = publish(settings, pack, rows)[1][-1].estimate
     assert estimate
