@@ -1,5 +1,6 @@
 """Installation, upgrade and removal of the service: its units, drop-ins, udev rule and user."""
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -65,7 +66,7 @@ USER_STATE = ".local/state/bms-estimator"
 UDEV_CONTROL = Path("/run/udev/control")
 """Socket of udev, which does not run in containers."""
 NOT_STARTED = " under systemd; systemd does not run here, so it is not started now"
-"""Addition to the report of the enabled service on a machine without systemd, such as a container."""
+"""Addition to the text "it starts with the machine" on a machine without systemd, such as a container."""
 OTHER_UNITS = f"{paths.NAME}@*.service"
 """Pattern of the units of other packs."""
 Report = Callable[[str, str], None]
@@ -134,14 +135,14 @@ def require_stopped(settings: Settings, home: Path, start_command: str) -> None:
     Raises:
         UserError: A process serves the pack. The message contains the commands that stop it and start the service.
     """
-    name = settings.pack.name
     for folder in [settings.state.folder] if settings.state.folder else [home / USER_STATE, paths.STATE]:
-        process = lock_holder(folder.expanduser(), name)
-        if process and f"/{paths.NAME}" not in Path(f"/proc/{process}/cgroup").read_text(encoding="utf-8"):
-            raise UserError(
-                f"{name}: process {process} runs this pack by hand, so that the service is installed but not started; "
-                f"stop the process, then start the service:\n  sudo kill {process}\n  sudo {start_command}"
-            )
+        process = lock_holder(folder.expanduser(), settings.pack.name)
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # the process has just ended
+            if process and f"/{paths.NAME}" not in Path(f"/proc/{process}/cgroup").read_text(encoding="utf-8"):
+                raise UserError(
+                    f"{settings.pack.name}: process {process} runs this pack by hand, so that the service is installed but "
+                    f"not started; stop the process, then start the service:\n  sudo kill {process}\n  sudo {start_command}"
+                )
 
 
 def compile_ahead(program: Path) -> None:

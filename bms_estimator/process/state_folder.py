@@ -139,12 +139,13 @@ def is_locked(folder: Path, pack: str) -> bool:
 
 
 def lock_holder(folder: Path, pack: str) -> int | None:
-    """Return the process that holds the lock of a pack; None if no process holds it, or if it is unknown.
+    """Return the process that holds the lock of a pack; None if no process holds it, or if its id is unknown.
 
-    Each call leaves a connection in the short queue of the holder, so that later calls may not learn the process.
+    A process in another PID namespace, such as that of a container, has no id here. Each call leaves a connection in the short
+    queue of the holder, so that later calls may not learn the id.
     """
     with contextlib.suppress(OSError):
-        return _find_holder(_socket_name(folder, pack))[0]
+        return _find_holder(_socket_name(folder, pack))[0] or None  # 0: other PID namespace
     return None
 
 
@@ -166,7 +167,7 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
         else:
             return
         try:
-            process, user = _find_holder(name)
+            process_id, user = _find_holder(name)
         except ConnectionRefusedError:  # the holder does not listen yet, or has just ended
             time.sleep(ATTEMPT_DELAY_S)
             continue
@@ -175,7 +176,6 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
         if user not in _find_writers(folder):
             log.warning("another user holds this pack's lock: cannot ensure that only one process serves it", user=user)
             return
-        process_id = process
         break
     raise TemporaryError(
         f"{pack}: this pack is served already, by {f'process {process_id}' if process_id else 'another process'}; "
@@ -185,8 +185,7 @@ def _bind(lock: socket.socket, folder: Path, pack: str) -> None:
 
 def _socket_name(folder: Path, pack: str) -> str:
     """Return the name of the lock, a hash within the length limit of socket names."""
-    real_folder = os.path.realpath(folder)
-    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{real_folder}/{pack}')).hexdigest()[:32]}"
+    return f"\0bms-estimator-{hashlib.sha256(os.fsencode(f'{os.path.realpath(folder)}/{pack}')).hexdigest()[:32]}"
 
 
 def _find_holder(name: str) -> tuple[int, int]:
@@ -200,8 +199,9 @@ def _find_holder(name: str) -> tuple[int, int]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.setblocking(False)
         client.connect(name)
-        credentials = client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    process, user, _ = _CREDENTIALS.unpack(credentials)
+        process, user, _ = _CREDENTIALS.unpack(
+            client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        )
     return process, user
 
 

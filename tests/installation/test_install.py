@@ -2,18 +2,20 @@
 
 import os
 import shutil
+import socket
 import stat
 import subprocess
+import sys
 from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
 
-from bms_estimator.cli.settings.install import mosquitto_pub
+from bms_estimator.cli.settings.install import publish_command
 from bms_estimator.installation import program_copy
 from bms_estimator.installation.install import require_stopped
 from bms_estimator.model.errors import UserError
-from bms_estimator.process.state_folder import instance_lock
+from bms_estimator.process.state_folder import _socket_name, instance_lock
 from bms_estimator.settings.connections import MqttSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.version import __version__
@@ -85,6 +87,15 @@ def test_a_pack_that_runs_by_hand_is_named_with_the_commands_that_stop_it_and_st
         ),
     ):
         require_stopped(settings, tmp_path, start)
+
+
+def test_a_pack_whose_process_has_ended_or_has_no_id_here_does_not_prevent_the_start(tmp_path):
+    """A process that listened and has ended leaves its id to the socket, which the test still holds."""
+    with socket.socket(socket.AF_UNIX) as lock:
+        lock.bind(_socket_name(tmp_path / ".local/state/bms-estimator", "house"))
+        listen = f"import socket; socket.socket(fileno={lock.fileno()}).listen(1)"
+        subprocess.run([sys.executable, "-c", listen], pass_fds=[lock.fileno()], check=True)
+        require_stopped(Settings.model_validate({"pack": {"name": "house"}}), tmp_path, "")
 
 
 def test_only_root_and_the_service_can_read_settings_and_password(root, pack, capsys):
@@ -251,7 +262,7 @@ def test_the_command_for_home_assistant_logs_in_without_showing_the_password(tmp
     (tmp_path / "systemd-ask-password").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     with password_broker(tmp_path) as broker:
-        command = mosquitto_pub(MqttSettings(url=broker.url, username="owner", password_file=tmp_path / "password"))
+        command = publish_command(MqttSettings(url=broker.url, username="owner", password_file=tmp_path / "password"))
         assert PASSWORD not in command
         subprocess.run(f"{command} -t homeassistant/device/bms_house/config -r -n", shell=True, check=True)
 

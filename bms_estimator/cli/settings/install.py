@@ -69,12 +69,12 @@ def install_command(
     program = _program(machine)
     with _errors_of_files():
         may_start = install(machine, program, files, _report)
-    hand_command = f"{program} run {paths.PACK_FILE}"
+    run_command = f"{program} run {paths.PACK_FILE}"
     if may_start and machine.root == Path("/") and not no_start:
         require_stopped(
             load_settings(paths.PACK_FILE),
             _user_home(),
-            hand_command if machine.lacks_systemd else f"systemctl restart {paths.NAME}",
+            run_command if machine.lacks_systemd else f"systemctl restart {paths.NAME}",
         )
     if machine.has_running_systemd and not no_start:
         if may_start:
@@ -91,7 +91,7 @@ def install_command(
     page = load_settings(settings).page
     typer.echo("\nNext:")
     if machine.lacks_systemd:
-        _show_next((f"sudo {hand_command}", "run the pack by hand, because systemd does not run here"))
+        _show_next((f"sudo {run_command}", "run the pack by hand, because systemd does not run here"))
         return
     _show_next(
         (f"systemctl status {paths.NAME}", "show the state of charge, or why no samples arrive"),
@@ -109,13 +109,16 @@ def uninstall_command(
 ) -> None:
     """Stop and remove the service, its user, systemd units and udev rule. Settings and state remain. Requires root."""
     machine = _machine(root, "uninstall", ["--purge"] if purge else [])
-    program, removals = _own_path(), _home_assistant_removals(machine)
+    # before the removal, which deletes the link to the program, and with --purge the settings
+    program = _own_path()
+    removal_commands = _home_assistant_removals(machine)
     with _errors_of_files():
         remaining = uninstall(machine, purge=purge, report=_report)
     remaining += [path for path in (_user_home() / name for name in USER_FOLDERS) if machine.path(path).exists()]
-    remaining += [program] * program.exists()
-    if removals:
-        typer.echo(f"\nTo remove the pack from Home Assistant:\n{removals}")
+    if program.exists():
+        remaining.append(program)
+    if removal_commands:
+        typer.echo(f"\nTo remove the pack from Home Assistant:\n{removal_commands}")
     typer.echo(f"\nRemaining: {', '.join(map(str, remaining)) or 'nothing'}")
 
 
@@ -127,20 +130,26 @@ def _home_assistant_removals(machine: Machine) -> str:
             settings = load_settings(file)
             if settings.mqtt and settings.home_assistant.enabled:
                 commands.append(
-                    f"  {mosquitto_pub(settings.mqtt)} -t {discovery_topic(settings.home_assistant, settings.pack.name)} -r -n"
+                    f"  {publish_command(settings.mqtt)} -t {discovery_topic(settings.home_assistant, settings.pack.name)} -r -n"
                 )
     return "\n".join(commands)
 
 
-def mosquitto_pub(mqtt: MqttSettings) -> str:
-    """Return a shell command that publishes to the first broker. It asks for the password."""
+def publish_command(mqtt: MqttSettings) -> str:
+    """Return a shell command, ``mosquitto_pub`` with the options of the first broker. It asks for the password."""
     broker = parse_url(mqtt.urls[0])
-    values = {"-h": broker.host, "-p": broker.port, "-u": mqtt.username, "--cafile": mqtt.ca_file}
-    values |= {"--cert": mqtt.cert_file, "--key": mqtt.key_file or mqtt.cert_file}
+    options = {
+        "-h": broker.host,
+        "-p": broker.port,
+        "-u": mqtt.username,
+        "--cafile": mqtt.ca_file,
+        "--cert": mqtt.cert_file,
+        "--key": mqtt.key_file or mqtt.cert_file,  # without a key file, the certificate file contains the key
+    }
     return " ".join(
         (
             "mosquitto_pub",
-            *(f"{option} {shlex.quote(str(value))}" for option, value in values.items() if value),
+            *(f"{option} {shlex.quote(str(value))}" for option, value in options.items() if value),
             *(["--tls-use-os-certs"] if broker.tls and not mqtt.ca_file else []),
             *(['-P "$(systemd-ask-password)"'] if mqtt.password_file else []),
         )
@@ -165,7 +174,7 @@ def _machine(root: Path, command: str, arguments: Sequence[str]) -> Machine:
         UserError: The user is not root, or the directory contains no system.
     """
     if os.geteuid() != 0:
-        options = [f"--root={root.resolve()}"] * (root != Path("/"))
+        options = [] if root == Path("/") else [f"--root={root.resolve()}"]
         raise UserError(f"requires root: sudo {' '.join([str(_own_path()), command, *options, *arguments])}")
     if not root.is_dir():
         raise UserError(f"--root {root}: is not a directory")
