@@ -57,7 +57,8 @@ def create_pack(file: Path, answers: Answers, setup_port: int = 0) -> NewPack:
     pack = settings.pack
     cell = load_cell(pack.cell, pack.capacity_ah).pack(pack.series, pack.parallel)
     warnings = check_settings(settings, cell)
-    values = (each.voltage_v, each.current_a) if (each := answers.measured) else (math.nan, math.nan)
+    measured = answers.measured
+    values = (measured.voltage_v, measured.current_a) if measured else (math.nan, math.nan)
     warnings += implausible_measurement(cell, *values, answers.device_capacity_ah or math.nan)
     create_pack_file(file, answers.tables)
     logins = {answers.password_file(key): each for key, each in answers.logins.items() if each.password is not None}

@@ -77,7 +77,7 @@ def default_places() -> list[str]:
 
     Bluetooth is not one of them if its package is missing.
     """
-    return [*board_ports(), DEFAULT_BROKER, *({BLUETOOTH} - missing_packages().keys())]
+    return [*board_ports(), DEFAULT_BROKER, *([] if BLUETOOTH in missing_packages() else [BLUETOOTH])]
 
 
 async def search(places: Sequence[str]) -> SearchResult:
@@ -99,9 +99,10 @@ async def _search_or_report(place: str, result: SearchResult) -> None:
     """Search a place, and add an exception to the failures."""
     try:
         await _search_place(place, result)
+    except UserError as error:  # names the place
+        result.failures.append(str(error))
     except Exception as error:  # noqa: BLE001 - one place must not end the search of the others
-        text = f"{without_secrets(place)}: cannot be searched: {type(error).__name__}: {error}"
-        result.failures.append(str(error) if isinstance(error, UserError) else text)  # a UserError names the place
+        result.failures.append(f"{without_secrets(place)}: cannot be searched: {type(error).__name__}: {error}")
 
 
 async def _search_place(place: str, result: SearchResult) -> None:
@@ -153,8 +154,7 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
     try:
         async with BrokerConnector(settings)(brokers(settings)[0], options) as connection:
             result.broker = login
-            denied = await connection.subscribe(None, ["#"])
-            if denied:
+            if denied := await connection.subscribe(None, ["#"]):
                 result.failures.append(f"{url}: not allowed to read #: {denied['#']}")
                 return
             with contextlib.suppress(TimeoutError):
@@ -163,8 +163,8 @@ async def _search_mqtt(address: str, result: SearchResult) -> None:
                         message = await connection.receive()
                         recognition.add_message(message.topic, message.payload, retained=message.retain)
     except LoginError:
-        reason = "requires a user name and a password"
-        result.failures.append(f"{url}: {reason if login.username is None else 'user name or password wrong'}")
+        reason = "requires a user name and a password" if login.username is None else "user name or password wrong"
+        result.failures.append(f"{url}: {reason}")
         result.login_required.append(login)
     except BrokerConnectionError as error:
         result.failures.append(f"{url}: {error}")

@@ -64,7 +64,9 @@ class SilenceLog:
 
     def on_samples(self, now_s: float) -> None:
         """Permit each reason to be logged again. ``now_s`` is the monotonic clock [s]."""
-        if max(self._logged_s.values(), default=-math.inf) > self._samples_s:
+        if (
+            max(self._logged_s.values(), default=-math.inf) > self._samples_s
+        ):  # a reason was logged since the last samples
             log.info("samples arrive again")
         self._samples_s = now_s
 

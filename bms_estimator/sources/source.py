@@ -112,7 +112,9 @@ CHECK_INTERVAL_S = 1.0
 SILENT_PERIODS = 3.0
 """Number of sample periods without a sample after which a source counts as silent."""
 RECONNECT_GRACE_S = 30.0
-"""Additional time after a reconnection before a silent source is reported [s]. A device that publishes to a broker has to reconnect, too."""
+"""Additional time after a reconnection before a silent source is reported [s].
+
+The device behind a broker loses its connection at a restart of the broker, too, and reconnects later."""
 NO_SAMPLE_YET = "connected, no sample yet"
 """Reason for silence after a connection, unless the producer or the decoder reports a fault."""
 
@@ -127,12 +129,12 @@ class LineProducer(ABC):
     """Producer of samples from a device that is not on a serial port. It does all I/O of the source.
 
     It yields samples as lines of JSON, like a board that prints text, so that one reader serves both.
-
-    Attributes:
-        conflict: Description of a second publisher of the samples, a sentence; empty without one.
     """
 
     conflict: str = ""
+    """Description of a second publisher of the samples, a sentence; empty without one."""
+    first_invalid: str = ""
+    """Description of the first value since start that is no number; empty without one."""
 
     @property
     @abstractmethod
@@ -154,9 +156,6 @@ class LineProducer(ABC):
     def counters(self) -> Mapping[str, int]:
         """Number of faults since start, by kind."""
         return {}
-
-    first_invalid: str = ""
-    """Description of the first value that is no number; empty without one."""
 
     @property
     def fault(self) -> str | None:
@@ -325,8 +324,9 @@ class LineSource:
             self._lines.put_nowait((self._wall_offset_s + self._monotonic(), line))
             return
         self._connections += 1
-        grace_s = RECONNECT_GRACE_S if self._connections > 1 else 0.0
-        self._connected, self._last_sample_s = True, self._monotonic() + grace_s
+        self._connected = True
+        # a time in the future defers the report of a silence
+        self._last_sample_s = self._monotonic() + (RECONNECT_GRACE_S if self._connections > 1 else 0.0)
         self._silence_reason = NO_SAMPLE_YET
         log.info("connected", source=self._producer.name)
 

@@ -126,8 +126,12 @@ def new(
         sensor = compare_with_multimeter(prompts, answers.device, meter) if measured else ()
         answers = replace(answers, measured=measured, name=file.stem, sensor=sensor)
         # in the order of ``QUESTIONS``, like the help texts above
-        given = (name, cell, capacity_ah, series, parallel, full_voltage_v, cutoff_voltage_v, max_discharge_a)
-        for question, option in zip(QUESTIONS, (*given, max_charge_a, device_soc_std, broker), strict=True):
+        given = (
+            *(name, cell, capacity_ah, series, parallel),
+            *(full_voltage_v, cutoff_voltage_v, max_discharge_a, max_charge_a),
+            *(device_soc_std, broker),
+        )
+        for question, option in zip(QUESTIONS, given, strict=True):
             if option is not None or question.is_asked(answers):
                 answers = _ask(prompts, question, option, answers)
         pack = create_pack(file, answers)
@@ -207,9 +211,8 @@ def _choose_device(prompts: Prompts, result: SearchResult, device: str | None) -
     may_search = prompts.is_interactive and device is None
     while True:
         parse = partial(_parse_device, result=result, may_search=may_search)
-        default = "1" if len(result.choices) == 1 else ""
         text = f"Number of the device, or another place to search ({_place_kinds()})"
-        chosen = prompts.ask(text, "--device", device, parse, default=default)
+        chosen = prompts.ask(text, "--device", device, parse, default="1" if len(result.choices) == 1 else "")
         if isinstance(chosen, FoundDevice):
             return Answers(chosen, found_broker=result.broker)
         new_result = _log_in(prompts, _search([chosen], result.devices))

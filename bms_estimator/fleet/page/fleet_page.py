@@ -25,7 +25,7 @@ from bms_estimator.settings.connections import PageSettings
 PAGE_QUERIES = ("failing", "soh", "outliers", "honest")
 """Names of the queries on the page."""
 MAX_ROWS = 20
-"""Maximum number of rows of a result."""
+"""Maximum number of rows of a query's result on the page."""
 OVERVIEW_S = 2.0
 """Interval between two overviews of the fleet [s]."""
 QUERY_S = 600.0
@@ -124,8 +124,6 @@ async def _send_query_results(hours_folder: Path, latest: LatestValues) -> None:
 
     A query of a large fleet takes seconds. The process ends only after it, because a thread cannot be cancelled.
     """
-    from bms_estimator.fleet.page.fleet_page import PAGE_QUERIES, run_page_query  # noqa: PLC0415 - only queries need duckdb
-
     while True:
         results = {name: await asyncio.to_thread(run_page_query, hours_folder, name) for name in PAGE_QUERIES}
         latest.set_value(ANSWERS_KEY, json.dumps(results, allow_nan=False, separators=(",", ":")))

@@ -55,8 +55,7 @@ def build_screen(view: ViewState, width: int) -> RenderableType:
     lines: list[RenderableType] = [table, *messages[:MAX_MESSAGES]]
     if len(messages) > MAX_MESSAGES:
         lines.append(Text(f"alarms and faults not shown: {len(messages) - MAX_MESSAGES}", style=URGENT_STYLE))
-    log_lines = map(Text.from_ansi, view.log[-LOG_LINES:])
-    return Group(*lines, *log_lines, Text(view.hint, style="cyan"))
+    return Group(*lines, *map(Text.from_ansi, view.log[-LOG_LINES:]), Text(view.hint, style="cyan"))
 
 
 def _pack_table(view: ViewState, pack: PackView, width: int) -> Table:
@@ -247,15 +246,20 @@ class TerminalSink:
 
     def _draw_screens(self) -> None:
         """Draw the newest state at most once each ``REDRAW_S``, only its changed lines. The last screen stays on the terminal."""
-        screen, drawn = None, set[tuple[object, ...]]()
+        screen = None
+        drawn = set[tuple[object, int, str]]()
         with self._console.screen():
             for state in self._until_closed(self._states):
-                screen, key = build_screen(state, self._console.width), (self._console.size, state.now_s // REPAINT_S)
+                screen = build_screen(state, self._console.width)
                 with self._console.capture() as capture:
                     self._console.print(Screen(screen), end="")
-                lines = [(key, row, line) for row, line in enumerate(capture.get().split("\n"), 1)]
-                self._console.file.write("".join(f"\x1b[{each[1]};1H{each[2]}" for each in lines if each not in drawn))
-                drawn = set(lines)
+                # a new value of ``frame`` makes all lines differ from the drawn ones, so that all are drawn
+                frame = self._console.size, state.now_s // REPAINT_S
+                lines: set[tuple[object, int, str]] = {
+                    (frame, row, line) for row, line in enumerate(capture.get().split("\n"), 1)
+                }
+                self._console.file.write("".join(f"\x1b[{row};1H{line}" for _, row, line in sorted(lines - drawn)))
+                drawn = lines
                 self._closing.wait(REDRAW_S)
         if screen is not None:
             self._console.print(screen)

@@ -28,7 +28,8 @@ MAX_SPREAD = 0.5
 MIN_JUMPS = {"voltage": 0.01, "current": 0.2}
 """Minimum jump between two messages, as a fraction of the larger value, by quantity. Smaller changes count as repeats."""
 MAX_RETURN_GAPS = 2.0
-"""Time without a return to an earlier value after which the second publisher has stopped, in longest gaps between returns."""
+"""Time without a return to an earlier value after which the second publisher counts as stopped, as a multiple of the longest
+interval between two returns."""
 SAME_FRACTION = 0.2
 """Two values belong to one publisher if they differ by less than this fraction of the jump between the two publishers."""
 
@@ -94,10 +95,10 @@ class PublisherConflict:
     @property
     def _has_two_publishers(self) -> bool:
         jumps = [message for message in self._messages if message.is_jump]
-        returns, now_s = [message for message in jumps if message.is_back], self._messages[-1].arrival_s
+        returns = [message for message in jumps if message.is_back]
         if self._quick_returns() < MIN_RETURNS or len(returns) < MIN_RETURN_FRACTION * len(jumps):
             return False
-        if now_s - returns[-1].arrival_s > MAX_RETURN_GAPS * max(_intervals_s(returns)):
+        if self._messages[-1].arrival_s - returns[-1].arrival_s > MAX_RETURN_GAPS * max(_intervals_s(returns)):
             return False
         repeats = len(self._messages) - len(jumps)
         return repeats >= MIN_REPEAT_FRACTION * len(self._messages) or self._jumps_are_regular(jumps)
