@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from bms_estimator.sources.factory import KINDS
-from tests.command_line import run
+from tests.command_line import error, run
 
 
 @pytest.mark.parametrize(
@@ -30,6 +30,5 @@ def test_missing_package_is_reported_with_its_extra(
     monkeypatch.setitem(sys.modules, package, None)  # its import fails
     pack = tmp_path / "pack.toml"
     pack.write_text(f"[source]\n{source}\n")
-    code, _, err = run(capsys, "record", "--pack", pack, tmp_path / "out.bmsraw")
-    assert code == 2
+    err = error(run(capsys, "record", "--pack", pack, tmp_path / "out.bmsraw"))
     assert f"this command needs the package {package}: pip install 'bms_estimator[{extra}]'" in err

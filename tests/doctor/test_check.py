@@ -62,6 +62,7 @@ def test_a_check_that_hangs_is_a_warning_and_the_others_run() -> None:
 
     begun, hung, good = run_checks(
         [
+            # without a finding if the slow check has begun, so that its time limit is checked afterwards
             Check("waits for the slow check", lambda: [] if has_begun.wait(LONG_S) else succeed(), timeout_s=LONG_S),
             Check("slow", hang, timeout_s=0.2),
             Check("good", succeed),

@@ -17,7 +17,7 @@ from bms_estimator.service.pack_service import run_pack_service
 from bms_estimator.settings.connections import EdgeSettings
 from bms_estimator.settings.pack import Settings
 from bms_estimator.telemetry.health import sample_counters
-from tests.command_line import PROGRAM, run, running_program
+from tests.command_line import PROGRAM, error, run, running_program
 from tests.fleet.nats_cluster import NatsCluster, running
 from tests.fleet.receiver import Receiver
 from tests.patience import LONG_S, until
@@ -120,8 +120,7 @@ async def test_run_with_an_edge_sends_all_samples_that_it_estimates_from_or_drop
 def test_edge_without_a_server_url_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "pack.toml"
     path.write_text("[pack]\n")
-    code, _, err = run(capsys, "edge", path)
-    assert code == 2
+    err = error(run(capsys, "edge", path))
     assert 'edge: missing: where samples are sent, as in [edge] with url = "mqtt://host:port"' in err
 
 
@@ -138,9 +137,7 @@ def test_error_reports_the_invalid_edge_setting(
 ) -> None:
     path = tmp_path / "pack.toml"
     path.write_text(f'[sensor]\nport = "/dev/none"\n[edge]\n{table}\n')
-    code, _, err = run(capsys, "edge", path)
-    assert code == 2
-    assert message in err
+    assert message in error(run(capsys, "edge", path))
 
 
 def test_config_check_reads_the_password_file_of_the_server(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

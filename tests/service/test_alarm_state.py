@@ -656,7 +656,7 @@ async def test_after_a_suspend_the_relay_stays_open_until_new_samples_are_watche
         await wait_until(lambda: board.levels)
         assert all(board.levels)
         board.levels.clear()
-        now_s = 1000.0
+        now_s = 1000.0  # beyond the long limit of ``link_lost``
         source.give(*((float(t), 0.0, 3.8, 25.0, 0) for t in range(12, 32)))
         await wait_until(lambda: board.levels)
         for t in range(1000, 1020):

@@ -5,7 +5,7 @@ import pytest
 from pyarrow import parquet
 
 from bms_estimator.sources.captures.replay import load_capture
-from tests.command_line import run
+from tests.command_line import error, run
 from tests.telemetry.alarm_captures import Line, record
 
 
@@ -90,8 +90,7 @@ def test_the_export_of_a_cycler_is_converted_with_a_note_on_what_was_guessed(cap
 
 
 def test_an_unknown_suffix_is_an_error_that_lists_the_known_ones(capsys, tmp_path, board):
-    code, _, err = run(capsys, "convert", board, "--out", tmp_path / "out.xyz")
-    assert code == 2
+    err = error(run(capsys, "convert", board, "--out", tmp_path / "out.xyz"))
     assert err.startswith(
         f"error: --out {tmp_path / 'out.xyz'}: the name must end in .csv, .csv.gz or .parquet; Battery Data"
     )

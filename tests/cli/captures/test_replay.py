@@ -22,7 +22,7 @@ from bms_estimator.model.cell import load_cell
 from bms_estimator.sources.captures.raw_capture import CaptureHeader, CaptureWriter
 from bms_estimator.sources.captures.replay import load_capture
 from bms_estimator.telemetry.state import NOT_IDENTIFIED
-from tests.command_line import run
+from tests.command_line import error, run
 
 pytestmark = pytest.mark.usefixtures("few_draws")
 
@@ -196,12 +196,9 @@ def test_a_higher_cut_off_voltage_is_reached_earlier(discharge, capsys):
 
 
 def test_an_unusable_cut_off_voltage_is_reported(capture, capsys):
-    code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--cutoff-v", "4.3")
-    assert code == 2
+    err = error(run(capsys, "replay", capture, "--cell", "ncr18650", "--cutoff-v", "4.3"))
     assert "pack.cutoff_v = 4.3: must be below 4.16 V, the voltage of the full pack" in err
-    code, _, err = run(capsys, "replay", capture, "--cell", "pem_30w", "--cutoff-v", "8")
-    assert code == 2
-    assert "--cutoff-v: " in err
+    assert "--cutoff-v: " in error(run(capsys, "replay", capture, "--cell", "pem_30w", "--cutoff-v", "8"))
 
 
 def test_csv_and_parquet_are_equal_bit_for_bit(capture, tmp_path, capsys):
@@ -220,9 +217,7 @@ def test_replay_starts_at_the_given_soc(capture, capsys):
         assert code == 0
         initial_socs.append(json.loads(out)["soc_initial"])
     assert initial_socs == pytest.approx([0.3, 0.7], abs=0.15)  # the first voltage corrects the SOC
-    code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", "1.5")
-    assert code == 2
-    assert "'--soc'" in err
+    assert "'--soc'" in error(run(capsys, "replay", capture, "--cell", "ncr18650", "--soc", "1.5"))
 
 
 def test_summary_is_printed_as_a_table(capture, capsys):
@@ -280,8 +275,7 @@ def test_capture_is_never_overwritten(capture, tmp_path, capsys):
     before, link = capture.read_bytes(), tmp_path / "link.csv"
     link.symlink_to(capture)
     for out in (capture, link):
-        code, _, err = run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--force")
-        assert code == 2
+        err = error(run(capsys, "replay", capture, "--cell", "ncr18650", "--out", out, "--force"))
         assert "is also an input" in err
     assert capture.read_bytes() == before
 
@@ -292,8 +286,7 @@ def test_truncated_gzip_is_reported(capture, tmp_path, capsys):
         shutil.copyfileobj(plain, packed)
     truncated.write_bytes(complete.read_bytes()[:-20])
     assert run(capsys, "replay", complete, "--cell", "ncr18650", "--json")[0] == 0
-    code, _, err = run(capsys, "replay", truncated, "--cell", "ncr18650", "--json")
-    assert code == 2
+    err = error(run(capsys, "replay", truncated, "--cell", "ncr18650", "--json"))
     assert "truncated.csv.gz: gzip data damaged or cut short" in err
 
 
@@ -352,9 +345,7 @@ def test_backward_time_steps_are_reported(tmp_path, capsys):
 
 
 def test_folder_is_rejected_as_capture(tmp_path, capsys):
-    code, _, err = run(capsys, "replay", tmp_path, "--cell", "ncr18650")
-    assert code == 2
-    assert f"{tmp_path}: is a directory" in err
+    assert f"{tmp_path}: is a directory" in error(run(capsys, "replay", tmp_path, "--cell", "ncr18650"))
 
 
 def test_replay_equals_estimate_bit_for_bit(data, tmp_path, capsys):
@@ -473,6 +464,5 @@ def test_recording_of_another_protocol_is_rejected(tmp_path, capsys):
     with CaptureWriter(capture, CaptureHeader("junctek", "/dev/ttyUSB0", 115_200, "charge_positive")) as writer:
         writer.write(0.0, b":r50=1,34,5166,1030,109337,11738441,62100651,48663,125,0,99,0,644,9117,\r\n")
     pack.write_text("[pack]\n")
-    code, _, err = run(capsys, "replay", capture, "--pack", pack)
-    assert code == 2
+    err = error(run(capsys, "replay", capture, "--pack", pack))
     assert "recorded with protocol 'junctek', but sensor.protocol is 'binary'" in err

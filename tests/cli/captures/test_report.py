@@ -236,8 +236,7 @@ def test_residuals_are_measured_less_modeled_voltage(tmp_path, capsys, steps_csv
         for row in rows[::500]:
             assert float(row["voltage_v"]) - float(row["modeled_v"]) == pytest.approx(float(row["error_v"]), abs=1e-12)
         assert float(rows[0]["soc"]) == pytest.approx(0.98, abs=2e-3)
-    err = error(run(capsys, "validate", steps_csv, "--cell", "ncr18650", "--out", tmp_path / name))
-    assert "exists already" in err
+    assert "exists already" in error(run(capsys, "validate", steps_csv, "--cell", "ncr18650", "--out", tmp_path / name))
 
 
 def test_page_has_the_rated_capacity_of_the_cell(page):

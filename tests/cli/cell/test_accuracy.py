@@ -92,5 +92,4 @@ def test_a_use_can_be_given_for_a_pack_without_a_history(capsys: pytest.CaptureF
 def test_an_unusable_use_is_rejected(
     capsys: pytest.CaptureFixture[str], arguments: tuple[object, ...], message: str
 ) -> None:
-    err = error(run(capsys, "accuracy", *arguments))
-    assert message in err
+    assert message in error(run(capsys, "accuracy", *arguments))

@@ -8,7 +8,7 @@ import pytest
 from tests.calibration.simulated_load import TRUTH
 from tests.calibration.simulated_relaxation import relaxation
 from tests.cli.cell.test_ocv import save
-from tests.command_line import run
+from tests.command_line import error, run
 
 CAPACITY_AH = TRUTH.cell.capacity_ah
 
@@ -53,8 +53,7 @@ def test_current_in_milliamperes_is_detected(capsys, capture, tmp_path):
     rows[:, 1] *= 1e3
     wrong = tmp_path / "ma.csv"
     np.savetxt(wrong, rows, delimiter=",", header="time_s,current_a,voltage_v", comments="")
-    code, _, err = run(capsys, "capacity", wrong, "--cell", "ncr18650")
-    assert code == 2
+    err = error(run(capsys, "capacity", wrong, "--cell", "ncr18650"))
     assert "Ah, but 3 Ah is declared: is the current in amperes" in " ".join(err.split())
 
 
@@ -78,8 +77,7 @@ def test_error_on_missing_rests_suggests_a_remedy(tmp_path, capsys):
 
 
 def test_wrong_sign_of_the_current_is_detected(capsys, capture):
-    code, _, err = run(capsys, "capacity", capture, "--cell", "ncr18650", "--current-sign", "charge_positive")
-    assert code == 2
+    err = error(run(capsys, "capacity", capture, "--cell", "ncr18650", "--current-sign", "charge_positive"))
     assert "check the sign of the current (--current-sign)" in err
     assert "rest" not in err.replace("the rests", "")  # no advice to rest the cell
 
@@ -96,8 +94,7 @@ def test_wrong_sign_of_the_current_is_detected(capsys, capture):
     ],
 )
 def test_wrong_cell_is_detected(capsys, capture, cell, message):
-    code, _, err = run(capsys, "capacity", capture, "--cell", cell, "--capacity-ah", "3")
-    assert code == 2
+    err = error(run(capsys, "capacity", capture, "--cell", cell, "--capacity-ah", "3"))
     assert message in err
     assert "longer rests" not in err
     assert "rest again" not in err
@@ -106,6 +103,5 @@ def test_wrong_cell_is_detected(capsys, capture, cell, message):
 def test_duplicate_capture_is_rejected(capsys, capture, tmp_path):
     other = tmp_path / "copy.csv"
     other.write_bytes(capture.read_bytes())
-    code, _, err = run(capsys, "capacity", capture, other, "--cell", "ncr18650")
-    assert code == 2
+    err = error(run(capsys, "capacity", capture, other, "--cell", "ncr18650"))
     assert err == "error: rests.csv and copy.csv: the same samples; give each capture once\n"

@@ -9,7 +9,7 @@ from bms_estimator.calibration.elements import identify
 from bms_estimator.kernels.cell_model.chen_mora import r_s
 from bms_estimator.model.cell import load_cell
 from tests.calibration.simulated_load import TRUTH, capture, steps
-from tests.command_line import run
+from tests.command_line import error, run
 
 ERROR_KEYS = ["samples", "voltage_rms_mv", "mean_abs_percent", "max_abs_percent"]
 
@@ -86,8 +86,7 @@ def test_user_errors_end_with_code_2(tables, tmp_path, capsys):
     assert (code, text) == (2, "")
     assert "error: flipped.csv: the current's sign is wrong" in err
     assert "error: flipped.csv: SOC runs from 0.98" in err
-    code, _, err = run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", flipped, "--force")
-    assert code == 2
+    err = error(run(capsys, "identify", flipped, "--cell", "ncr18650", "--out", flipped, "--force"))
     assert "is also an input" in err
 
 

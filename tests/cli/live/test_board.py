@@ -11,7 +11,7 @@ from serial.tools import list_ports
 from bms_estimator.simulation.virtual_adc import BoardParts, Reading
 from bms_estimator.simulation.virtual_board import VirtualBoard
 from bms_estimator.sources.serial import device_detection
-from tests.command_line import run
+from tests.command_line import error, run
 from tests.patience import LONG_S
 from tests.serial_line import usb_port
 
@@ -75,8 +75,7 @@ def test_given_voltage_at_aref_sets_the_bandgap_and_so_the_reference(capsys):
 def test_implausible_voltage_at_aref_is_rejected(capsys, monkeypatch, aref_v):
     monkeypatch.setattr(device_detection, "REFERENCE_SAMPLES", 10)
     with running_board() as path:
-        code, _, err = run(capsys, "board", path, "--aref-v", aref_v, "--serial", "7")
-        assert code == 2
+        err = error(run(capsys, "board", path, "--aref-v", aref_v, "--serial", "7"))
         assert err.startswith(f"error: --aref-v {aref_v}: ")
         assert "between 1.0 and 1.2 V" in err
         _, out, _ = run(capsys, "board", path)

@@ -186,8 +186,7 @@ def test_checkpoint_of_another_pack_is_reported(capsys: pytest.CaptureFixture[st
     settings, cell = load_pack(other)
     [checkpoint] = [path for path in (pack.parent / "state").iterdir() if not path.name.endswith(LOAD_SUFFIX)]
     CheckpointFile(tmp_path / "state", settings, cell).path.write_bytes(checkpoint.read_bytes())
-    err = error(run(capsys, "forecast", other, "--power-w", 5))
-    assert "it belongs to another pack or cell" in err
+    assert "it belongs to another pack or cell" in error(run(capsys, "forecast", other, "--power-w", 5))
 
 
 def test_damaged_load_is_reported_and_a_given_load_still_works(

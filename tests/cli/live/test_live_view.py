@@ -40,7 +40,8 @@ def test_main_values_are_shown_on_any_screen_size(demo: PseudoTerminal, columns:
 def test_unchanged_lines_are_not_drawn_with_each_screen(demo: PseudoTerminal) -> None:
     begin = len(demo.output)
     demo.until(lambda: len(set(re.findall(r"\d\d:\d\d:\d\dZ", demo.output[begin:]))) > 5)
-    assert demo.output[begin:].count("Voltage") < 2  # a repaint draws the heading too
+    # the heading is drawn by a repaint, and after the last resize of the tests before
+    assert demo.output[begin:].count("Voltage") <= 2
 
 
 def test_interrupted_demo_prints_a_summary_and_restores_the_terminal(demo: PseudoTerminal) -> None:
@@ -52,7 +53,7 @@ def test_interrupted_demo_prints_a_summary_and_restores_the_terminal(demo: Pseud
     assert demo.process.returncode == 0
     assert demo.is_as_before()
     after_view = demo.output.split(ALTERNATE)[-1]
-    assert [sequence in after_view for sequence in (BACK, CURSOR)] == [True, True]
+    assert [sequence for sequence in (BACK, CURSOR) if sequence not in after_view] == []
     assert re.search(r"SOC error -20\.00% at the start, ", after_view.replace("\r\n", " "))
     assert "Traceback" not in demo.output
 

@@ -8,7 +8,7 @@ import pytest
 
 from bms_estimator.cli.main import COMMANDS
 from bms_estimator.version import __version__
-from tests.command_line import PROGRAM, run
+from tests.command_line import PROGRAM, error, run
 
 OUTPUTS = [
     (("config", "show"), ""),
@@ -58,9 +58,7 @@ def test_invalid_pack_file_is_an_error(content, message, tmp_path, capsys):
 def test_invalid_broker_url_is_an_error(tmp_path, capsys):
     pack = tmp_path / "pack.toml"
     pack.write_text('[sensor]\nport = "/dev/none"\n')
-    code, _, err = run(capsys, "run", pack, "--mqtt", "nonsense")
-    assert code == 2
-    assert "error: --mqtt nonsense: must be" in err
+    assert "error: --mqtt nonsense: must be" in error(run(capsys, "run", pack, "--mqtt", "nonsense"))
 
 
 @pytest.mark.parametrize("options", [("--port", "/dev/none"), ("--record", "new.bms"), ("--view",)])
@@ -76,9 +74,7 @@ def test_help_lists_all_commands_and_version_prints_the_version(capsys):
     assert code == 0
     assert [name for name in COMMANDS if f" {name} " not in out] == []
     assert run(capsys, "--version") == (0, f"bms-estimator {__version__}\n", "")
-    code, _, err = run(capsys, "nosuch")
-    assert code == 2
-    assert "No such command 'nosuch'" in err
+    assert "No such command 'nosuch'" in error(run(capsys, "nosuch"))
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -232,8 +232,7 @@ def test_invalid_backup_is_refused_and_the_server_is_unchanged(
     change, reason: str, backup: Path, servers: tuple[NatsCluster, NatsCluster], capsys: pytest.CaptureFixture[str]
 ) -> None:
     change(backup)
-    err = error(run(capsys, "fleet", "restore", backup, "--server", servers[1].url))
-    assert reason in err
+    assert reason in error(run(capsys, "fleet", "restore", backup, "--server", servers[1].url))
     assert asyncio.run(last_sequences(servers[1].url)) == dict.fromkeys(BACKUP_ORDER, 0)
 
 

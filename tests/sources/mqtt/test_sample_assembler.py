@@ -374,10 +374,8 @@ def test_retained_and_constant_values_count_while_a_publisher_is_online(max_sile
             max_silent_s=max_silent_s,
         )
     )
-    assert (
-        feed(assembler, [("home/pack", '{"u": 52, "i": 1}'), ("home/probe", "21"), ("home/soc", "62")], retained=True)
-        == []
-    )
+    state = [("home/pack", '{"u": 52, "i": 1}'), ("home/probe", "21"), ("home/soc", "62")]
+    assert feed(assembler, state, retained=True) == []
     samples = feed(assembler, [("home/status", "online")], 1.0, retained=True)
     complete = {"voltage_v": 52.0, "current_a": 1.0, "temperature_c": 21.0, "device_soc": 0.62}
     assert samples == [complete] * bool(max_silent_s)
@@ -593,8 +591,9 @@ def test_publisher_of_changes_and_of_regular_messages_does_not_count_as_two(*, r
 
 @pytest.mark.parametrize(("is_random", "detected_s"), [(False, 160.0), (True, 115.0)])
 def test_second_publisher_that_is_slower_or_random_is_detected(*, is_random: bool, detected_s: float) -> None:
-    rng, messages, at_s = random.Random(1), _merge_publishers(_Publisher(1.0, 0.0, 200.0, 5.0)), 100.3
-    while at_s < 160.0:
+    messages = _merge_publishers(_Publisher(period_s=1.0, first_s=0.0, last_s=200.0, current_a=5.0))
+    rng, at_s = random.Random(1), 100.3
+    while at_s < 160.0:  # times of the second publisher
         messages.append((at_s, -80.0))
         at_s += rng.expovariate(1.0) if is_random else 10.0
     _, times_s = _conflict_times(sorted(messages))

@@ -396,8 +396,7 @@ def test_accept_uses_the_given_folder_and_requires_a_stored_board(
     assert f"{tmp_path / 'mine'}/bms-estimator/house.board.json: no board is stored in this file" in err
     assert run(capsys, "board", "--folder", memory.path.parent, "--accept", pack)[0] == 0
     assert memory.load() == NO_BOARD
-    err = error(run(capsys, "board", "--folder", tmp_path))
-    assert "requires --accept" in err
+    assert "requires --accept" in error(run(capsys, "board", "--folder", tmp_path))
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
