@@ -154,10 +154,15 @@ def _device(
     publisher: Publisher, values: Mapping[str, float], broker: BrokerLogin, *, only_changes: bool
 ) -> FoundDevice:
     profile = PROFILES[publisher.profile]
-    address = {"prefix": publisher.prefix, "instance": publisher.instance}
-    address = {key: value for key, value in address.items() if value and value != profile.table.get(key)}
+    # values that differ from the defaults of the profile
+    address = {
+        key: value
+        for key, value in {"prefix": publisher.prefix, "instance": publisher.instance}.items()
+        if value and value != profile.table.get(key)
+    }
     source: dict[str, object] = {"kind": "mqtt", "profile": publisher.profile, **address}
-    source |= {"max_silent_s": MAX_SILENT_S} if only_changes else {}
+    if only_changes:
+        source["max_silent_s"] = MAX_SILENT_S
     sign = 1.0 if profile.current_sign == DISCHARGE else -1.0
     cells = int(is_live(np.array([v for key, v in values.items() if key.startswith("cell ")])).sum())
     return FoundDevice(

@@ -229,7 +229,7 @@ def _log_in(prompts: Prompts, result: SearchResult) -> SearchResult:
         if not prompts.is_interactive:
             typer.echo(f"-  give the login as {login.url.replace('://', '://user:pw@')}")
             break
-        typer.echo(f"   You are asked for both{' again' if login.username else ''}.")
+        typer.echo(f"   Enter the user name and the password{' again' if login.username else ''}.")
         username = str(
             typer.prompt(f"User name at {login.url} (empty: skip this broker)", default="", show_default=False)
         )

@@ -1,6 +1,6 @@
 """Sums over the samples of a publish window, sums of charge and energy, and the decision whether the SOC is known.
 
-A known SOC has an estimate that is certain enough to be shown and judged.
+The SOC is known if its estimate is certain enough to be shown, and to be compared with the limits of alarms.
 """
 
 import math

@@ -4,9 +4,9 @@ Each draw starts at a random block and passes the following blocks in order. Aft
 random block.
 
 A table contains the largest voltage drop of each block as a function of SOC. An RC current is the current filtered with the time
-constant of an RC pair. The drop is that for the RC currents with which the block began when it was observed. A draw enters the
-block with other RC currents. Because the RC network is linear, it only adds the voltage of the difference, which decays
-exponentially.
+constant of an RC pair. The tabulated drop holds for the RC currents at the beginning of the block when it was observed. A draw
+enters the block with other RC currents. Because the RC network is linear, the draw only adds the voltage of the difference,
+which decays exponentially.
 """
 
 import math

@@ -1,7 +1,7 @@
-"""Window of about a second of samples, whose mean is one measurement of the filter, with self-heating and rest.
+"""Window of about a second of samples, whose mean is one measurement of the filter.
 
-Charge that was not measured has an expected value and a std: in gaps, between runs of the service, and between slow or rounded
-samples.
+Charge that was not measured adds to the window an expected value and a std: in gaps, between runs of the service, and between
+slow or rounded samples. For a gap, both follow from the load before it.
 
 Without a temperature sensor, the cell's temperature follows from the losses in the window.
 

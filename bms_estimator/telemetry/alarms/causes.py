@@ -16,7 +16,7 @@ from bms_estimator.telemetry.cells import NO_FAULTY_CELL, CellAlarmInput
 from bms_estimator.telemetry.state import UNKNOWN_SOC, missing_margin_reason
 
 FaultyInput = Quantity | Literal["time", "publishers"]
-"""Faulty quantity of the samples."""
+"""Faulty quantity of the samples, or a fault of whole samples: their time stamps, or two publishers."""
 PROBE_TEXT = "a temperature probe is broken, loose or missing, or far from the others: check it"
 """Fault of temperature probes, and its remedy."""
 WRONG_CLOCK_TEXT = "the clock of the source runs at a wrong rate, and the arrival times are used instead"

@@ -111,6 +111,7 @@ class AlarmEvaluator:
         if cells_fault:
             causes.input_faults.add("cells", cells_fault, cells_fault)
         if conflict:
+            # always the same kind, so that the first text stays although the values in it vary
             causes.input_faults.add("publishers", "two", conflict)
         io["cells_unusable"] = bool(cells_fault)
         alarms.record["faults"] |= (bool(cells_fault) << CELLS) | (bool(causes.board_fault) << FAULTY_BOARD)

@@ -349,9 +349,9 @@ def test_a_publisher_at_a_broker_with_a_password_is_found_with_its_values(
 @pytest.mark.thorough
 def test_wizard_asks_for_the_password_of_a_broker_until_it_is_right(node_broker, file):
     dialog = [
-        (r"asked for both\.\n.*User name at", "owner"),
+        (r"Enter the user name and the password\.\n.*User name at", "owner"),
         ("Password", "wrong"),
-        (r"password wrong\n *You are asked for both again\.\n.*User name at", "owner"),
+        (r"password wrong\n *Enter the user name and the password again\.\n.*User name at", "owner"),
         ("Password", PASSWORD),
         ("Number of the device", ""),
         ("Compare the device", "n"),
