@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-LIMITS = {"bms_estimator": 45_536, "tests": 49_647}
+LIMITS = {"bms_estimator": 45_538, "tests": 49_647}
 
 
 def is_text(node: ast.stmt) -> bool:

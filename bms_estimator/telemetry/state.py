@@ -57,7 +57,7 @@ def clock_duration(duration_s: float) -> str:
     return f"{hours}:{minutes:02d}"
 
 
-UNKNOWN_SOC = "the SOC is not known yet: charge the pack to full once, or let it rest for ten minutes"
+UNKNOWN_SOC = "the SOC is not known yet: charge the pack to full once, or (not LFP) let it rest for ten minutes"
 """Reason for a missing value that needs a known SOC, with the remedy."""
 ALWAYS_STABLE = "the thesis's model is valid at each SOC: delta_1 and delta_2 are not above 0"
 """Reason for a missing margin while the capacitances are positive at each SOC."""

@@ -24,6 +24,7 @@ from bms_estimator.model.errors import UserError
 from bms_estimator.process.runtime import configure_logs
 from bms_estimator.service.kernel_compilation import background_compilation
 from bms_estimator.service.kernel_warm_up import load_kernels
+from bms_estimator.settings.connections import PageSettings
 from bms_estimator.settings.pack import require_new
 from bms_estimator.setup.answers import Answers, InvalidAnswerError
 from bms_estimator.setup.broker_login import BrokerLogin
@@ -149,7 +150,7 @@ def new(
             )
             if note := current_note(measured.current_a, pack.cell.cell.capacity_ah):
                 typer.echo(note)
-        _offer_install(prompts, file, install)
+        _offer_install(prompts, file, install, pack.settings.page)
 
 
 @contextmanager
@@ -290,8 +291,8 @@ def _ask(prompts: Prompts, question: Question, given: str | None, answers: Answe
     )
 
 
-def _offer_install(prompts: Prompts, file: Path, given: bool | None) -> None:
-    """Install the service, or print the commands that run and install it.
+def _offer_install(prompts: Prompts, file: Path, given: bool | None, page: PageSettings | None) -> None:
+    """Install the service, or print the commands that run and install it, and the address of its page.
 
     Raises:
         typer.Exit: The installation ended, with its exit code.
@@ -301,4 +302,5 @@ def _offer_install(prompts: Prompts, file: Path, given: bool | None) -> None:
         "Install the service, which runs at each start of this machine?", "--install", given, default=False
     ):
         raise typer.Exit(subprocess.run(command, check=False).returncode)  # noqa: S603 - the program of this process
-    typer.echo(f"run it here: {run_command(file)}\ninstall the service: {shlex.join(command)}")
+    address = f"; live page: http://{page.listen}" if page else ""
+    typer.echo(f"run it here: {run_command(file)}{address}\ninstall the service: {shlex.join(command)}")

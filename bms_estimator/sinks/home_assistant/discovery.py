@@ -93,7 +93,7 @@ _ALARM_AVAILABILITY = "{{ 'online' if value_json.watched or value_json.active el
 """Template of an alarm's availability. A raised alarm stays available even if its quantity is lost later."""
 FORMER_SENSORS = ("r_s_ohm",)
 """Keys of sensors of former versions, which Home Assistant removes."""
-_SOC_HINT = "{{ {'hint': '' if value_json.soc_percent is number else 'not known yet: charge the pack to full once, or let it rest for ten minutes'} | tojson }}"
+_SOC_HINT = "{{ {'hint': '' if value_json.soc_percent is number else 'not known yet: charge the pack to full once, or (not LFP) let it rest for ten minutes'} | tojson }}"
 """Template of the attribute ``hint``, which names the remedy while the state of charge is not known."""
 NAMEABLE = {*BATTERY, *FUEL_CELL, *CELL_VOLTAGES, CELL, *ALARMS, *get_args(Command)}
 """Entities that ``[home_assistant.names]`` may rename."""

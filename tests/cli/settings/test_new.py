@@ -125,7 +125,7 @@ def dialog(path: str) -> list[tuple[str, str, str]]:
         ("MQTT broker", "localhost", "localhost: must be mqtt://host:port"),
         ("MQTT broker", "mqtt://localhost:99999", "mqtt://localhost:99999: Port out of range 0-65535"),
         ("MQTT broker", "none", "pack.toml: written; house: lfp, 8 in series"),
-        ("Install the service", "n", "bms-estimator install"),
+        ("Install the service", "n", "; live page: http://127.0.0.1:"),
     ]
 
 
